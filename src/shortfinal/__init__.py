@@ -1,0 +1,99 @@
+"""shortfinal: runway keypoints with uncertainty, the pose they give, and whether to believe it.
+
+Names are loaded on first use, so that `import shortfinal` is instant and never loads torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from shortfinal.calibration import coverage, fit_sigma_scale, gaussian_nll, sharpness
+    from shortfinal.detector import KeypointDetector, ModelInfo
+    from shortfinal.errors import InputError
+    from shortfinal.geometry import Attitude, Camera, PixelWindow, Pose, project, project_jacobian, unproject
+    from shortfinal.integrity import (
+        Decision,
+        IntegrityVerdict,
+        check_integrity,
+        check_integrity_as_published,
+        check_integrity_batch,
+        detection_probability,
+        minimal_detectable_bias,
+    )
+    from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
+    from shortfinal.pipeline import FrameResult, LandingPipeline
+    from shortfinal.pose import PoseEstimate, PoseEstimateBatch, SolverStatus, estimate_pose, estimate_pose_batch
+    from shortfinal.runway import Runway, find_runway
+
+_HOME = {
+    "calibration": ("coverage", "fit_sigma_scale", "gaussian_nll", "sharpness"),
+    "detector": ("KeypointDetector", "ModelInfo"),
+    "errors": ("InputError",),
+    "geometry": ("Attitude", "Camera", "PixelWindow", "Pose", "project", "project_jacobian", "unproject"),
+    "integrity": (
+        "Decision",
+        "IntegrityVerdict",
+        "check_integrity",
+        "check_integrity_as_published",
+        "check_integrity_batch",
+        "detection_probability",
+        "minimal_detectable_bias",
+    ),
+    "keypoints": ("CORNER_NAMES", "GaussianKeypoints"),
+    "pipeline": ("FrameResult", "LandingPipeline"),
+    "pose": ("PoseEstimate", "PoseEstimateBatch", "SolverStatus", "estimate_pose", "estimate_pose_batch"),
+    "runway": ("Runway", "find_runway"),
+}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+
+__version__ = "0.1.0"
+__all__ = [
+    "CORNER_NAMES",
+    "Attitude",
+    "Camera",
+    "Decision",
+    "FrameResult",
+    "GaussianKeypoints",
+    "InputError",
+    "IntegrityVerdict",
+    "KeypointDetector",
+    "LandingPipeline",
+    "ModelInfo",
+    "PixelWindow",
+    "Pose",
+    "PoseEstimate",
+    "PoseEstimateBatch",
+    "Runway",
+    "SolverStatus",
+    "__version__",
+    "check_integrity",
+    "check_integrity_as_published",
+    "check_integrity_batch",
+    "coverage",
+    "detection_probability",
+    "estimate_pose",
+    "estimate_pose_batch",
+    "find_runway",
+    "fit_sigma_scale",
+    "gaussian_nll",
+    "minimal_detectable_bias",
+    "project",
+    "project_jacobian",
+    "sharpness",
+    "unproject",
+]
+
+
+def __getattr__(name: str) -> Any:
+    module = _MODULE_OF.get(name)
+    if module is None:
+        raise AttributeError(f"module 'shortfinal' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"shortfinal.{module}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,364 @@
+"""Camera, pose and projection.
+
+Frames, axes, units and the pixel centre: the table of conventions in docs/architecture.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from shortfinal.errors import InputError
+
+Array = NDArray[np.float64]
+
+# Columns: the body axes (x forward, y left, z up) seen in the camera's (x right, y down, z forward).
+BODY_FROM_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+_DISTORTION_LENGTHS = (0, 4, 5, 8)
+
+
+def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
+    """A read-only float64 copy of `value`, refused unless finite and of `shape` (None: any length).
+
+    Raises InputError naming the argument and, for a non-finite entry, its index.
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected numbers, got {value!r:.80}") from error
+    matches = array.ndim == len(shape) and all(
+        want in (None, got) for want, got in zip(shape, array.shape, strict=True)
+    )
+    if not matches:
+        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        raise InputError(f"{name}: expected shape {wanted}, got {array.shape}")
+    if not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise InputError(f"{name}: entry {list(index)} is {array[index]}; every entry must be finite")
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True)
+class PixelWindow:
+    """A rectangle of an image, resampled to `out_width` x `out_height`.
+
+    The one place where crops, resizes and label imports move pixel coordinates. Bounds are pixel
+    *edges* (the image spans 0 to width; the centre of pixel u lies at u + 1/2), so that with scale
+    s = out / extent a pixel u becomes (u + 1/2 - left) s - 1/2. The window may exceed the image.
+    """
+
+    left: float  # edge, px of the source image
+    top: float
+    width: float  # extent, px of the source image
+    height: float
+    out_width: int
+    out_height: int
+
+    def __post_init__(self) -> None:
+        values = (self.left, self.top, self.width, self.height)
+        if not all(map(math.isfinite, values)) or min(self.width, self.height) <= 0:
+            raise InputError(f"window: extents must be finite and positive, got {values}")
+        if min(self.out_width, self.out_height) < 1:
+            raise InputError("window: the output must be at least 1 x 1 pixel")
+
+    @classmethod
+    def resize(cls, width: int, height: int, out_width: int, out_height: int) -> PixelWindow:
+        """The whole of a `width` x `height` image, resized."""
+        return cls(0.0, 0.0, width, height, out_width, out_height)
+
+    @property
+    def scale(self) -> Array:
+        """Output pixels per source pixel, (2,): along u, along v."""
+        return np.array([self.out_width / self.width, self.out_height / self.height])
+
+    def apply(self, px: ArrayLike) -> Array:
+        """Source pixels (..., 2) to output pixels (..., 2)."""
+        return (np.asarray(px, float) + 0.5 - [self.left, self.top]) * self.scale - 0.5
+
+    def inverse(self, px: ArrayLike) -> Array:
+        """Output pixels (..., 2) to source pixels (..., 2)."""
+        return (np.asarray(px, float) + 0.5) / self.scale + [self.left, self.top] - 0.5
+
+    def inverse_cov(self, cov_px: ArrayLike) -> Array:
+        """Covariance of K keypoints (2K, 2K) in output pixels, as one in source pixels."""
+        cov = np.asarray(cov_px, float)
+        unscale = np.tile(1.0 / self.scale, cov.shape[0] // 2)
+        return cov * np.outer(unscale, unscale)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole camera with OpenCV's distortion.
+
+    Raises InputError for a non-positive size or focal length, a non-finite value, or a number of
+    distortion coefficients other than 0, 4, 5 or 8 (k1, k2, p1, p2, k3, k4, k5, k6).
+    """
+
+    width: int  # px
+    height: int  # px
+    fx: float  # focal length, px
+    fy: float
+    cx: float  # principal point, px; the centre of the top-left pixel is (0, 0)
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "distortion", tuple(float(k) for k in self.distortion))
+        values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not all(math.isfinite(v) for v in values):
+            raise InputError(f"camera: every intrinsic must be finite, got {values}")
+        if min(self.width, self.height) < 1 or min(self.fx, self.fy) <= 0:
+            raise InputError("camera: width, height, fx and fy must be positive")
+        if len(self.distortion) not in _DISTORTION_LENGTHS:
+            raise InputError(
+                f"camera: distortion has {len(self.distortion)} coefficients; "
+                f"OpenCV's order has {', '.join(map(str, _DISTORTION_LENGTHS))}"
+            )
+
+    @property
+    def matrix(self) -> Array:
+        """The 3 x 3 intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def intrinsics(self) -> Array:
+        """(fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6): what the kernels take."""
+        padding = (0.0,) * (8 - len(self.distortion))
+        return np.array((self.fx, self.fy, self.cx, self.cy, *self.distortion, *padding))
+
+    def view(self, window: PixelWindow) -> Camera:
+        """The camera that would have taken the resampled window directly."""
+        sx, sy = (float(s) for s in window.scale)
+        cx, cy = (float(c) for c in window.apply((self.cx, self.cy)))
+        return Camera(window.out_width, window.out_height, self.fx * sx, self.fy * sy, cx, cy, self.distortion)
+
+
+class Attitude(NamedTuple):
+    """Aviation sense, degrees: yaw right of the runway heading, nose up, right wing down positive."""
+
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Where the camera is, in the runway frame, and how it is turned.
+
+    `position_m` (3,) and `runway_from_camera` (3, 3, or a scipy Rotation). Raises InputError for a
+    wrong shape, a non-finite entry, or a matrix that is no rotation (to 1e-6).
+    """
+
+    position_m: Array
+    runway_from_camera: Array
+
+    def __post_init__(self) -> None:
+        rotation = self.runway_from_camera
+        rotation = rotation.as_matrix() if hasattr(rotation, "as_matrix") else rotation
+        rotation = as_array(rotation, (3, 3), "runway_from_camera")
+        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        if off > 1e-6 or np.linalg.det(rotation) < 0:
+            raise InputError(f"runway_from_camera: not a rotation (R Rt - 1 is up to {off:.1e}, or it mirrors)")
+        object.__setattr__(self, "position_m", as_array(self.position_m, (3,), "position_m"))
+        object.__setattr__(self, "runway_from_camera", rotation)
+
+    @classmethod
+    def from_attitude(
+        cls, position_m: ArrayLike, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0
+    ) -> Pose:
+        """A camera that looks along the body's x axis, from attitude in aviation sense (degrees)."""
+        yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
+        # In x forward, y left, z up, a turn to the right is negative about z and nose up negative
+        # about y; right wing down is positive about x.
+        runway_from_body = _rotation_z(-yaw) @ _rotation_y(-pitch) @ _rotation_x(roll)
+        return cls(np.asarray(position_m, float), runway_from_body @ BODY_FROM_CAMERA)
+
+    @property
+    def attitude(self) -> Attitude:
+        """Yaw, pitch and roll in degrees: the inverse of `from_attitude`."""
+        r = self.runway_from_camera @ BODY_FROM_CAMERA.T
+        yaw = -math.atan2(r[1, 0], r[0, 0])
+        pitch = math.asin(min(1.0, max(-1.0, r[2, 0])))
+        roll = math.atan2(r[2, 1], r[2, 2])
+        return Attitude(*(math.degrees(a) for a in (yaw, pitch, roll)))
+
+    def plus(self, increment: ArrayLike) -> Pose:
+        """Moved by a local increment (6,): p + dp, R exp(dtheta); metres and radians."""
+        d = np.asarray(increment, float)
+        return Pose(self.position_m + d[:3], self.runway_from_camera @ so3_exp(d[3:]))
+
+    def minus(self, other: Pose) -> Array:
+        """The local increment (6,) with `other.plus(increment)` equal to this pose."""
+        from scipy.spatial.transform import Rotation
+
+        turn = other.runway_from_camera.T @ self.runway_from_camera
+        return np.concatenate([self.position_m - other.position_m, Rotation.from_matrix(turn).as_rotvec()])
+
+
+def project(camera: Camera, pose: Pose, points: ArrayLike) -> Array:
+    """Pixels (K, 2) of `points` (K, 3), metres in the runway frame.
+
+    Raises InputError naming the first point that lies behind the camera.
+    """
+    px, _, depth = _project_all(camera, pose, points)
+    if not (depth > 0).all():
+        k = int(np.argmax(~(depth > 0)))
+        raise InputError(f"points: point {k} is behind the camera (depth {depth[k]:.2f} m)")
+    return px
+
+
+def project_jacobian(camera: Camera, pose: Pose, points: ArrayLike) -> Array:
+    """d(pixels) / d(local increment) of the pose, (2K, 6): pixels per metre and per radian.
+
+    Rows u0, v0, u1, v1, ...; columns as in `Pose.plus`. Raises as `project`.
+    """
+    project(camera, pose, points)
+    return _project_all(camera, pose, points)[1]
+
+
+def unproject(camera: Camera, px: ArrayLike) -> Array:
+    """Directions (K, 3) in the camera frame with z = 1, of pixels (K, 2); distortion removed.
+
+    Raises InputError where no undistorted direction exists: the pixel lies outside the lens model.
+    """
+    pixels = as_array(px, (None, 2), "px")
+    rays = np.ones((len(pixels), 3))
+    for k, (u, v) in enumerate(pixels):
+        x, y, ok = normalise_kernel(u, v, camera.intrinsics)
+        if not ok:
+            raise InputError(f"px: pixel {k} ({u:.1f}, {v:.1f}) is outside the range of the camera's distortion")
+        rays[k, :2] = x, y
+    return rays
+
+
+def so3_exp(rotation_vector: ArrayLike) -> Array:
+    """Rotation matrix of a rotation vector (3,), radians."""
+    out = np.empty((3, 3))
+    exp_kernel(np.asarray(rotation_vector, np.float64), out)
+    return out
+
+
+def _project_all(camera: Camera, pose: Pose, points: ArrayLike) -> tuple[Array, Array, Array]:
+    world = np.ascontiguousarray(as_array(points, (None, 3), "points"))
+    count = len(world)
+    px, jacobian, depth = np.empty(2 * count), np.empty((2 * count, 6)), np.empty(count)
+    rotation = np.ascontiguousarray(pose.runway_from_camera)
+    project_kernel(world, rotation, pose.position_m, camera.intrinsics, px, jacobian, depth)
+    return px.reshape(-1, 2), jacobian, depth
+
+
+def _rotation_x(a: float) -> Array:
+    c, s = math.cos(a), math.sin(a)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def _rotation_y(a: float) -> Array:
+    c, s = math.cos(a), math.sin(a)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def _rotation_z(a: float) -> Array:
+    c, s = math.cos(a), math.sin(a)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+# The kernels below are compiled; the solver calls the same ones, so that what it minimises is what
+# `project` draws. Scalars and caller-owned arrays only: nothing is allocated per call.
+
+
+@njit(cache=True, nogil=True)
+def distort_kernel(x, y, k):  # type: ignore[no-untyped-def]
+    """OpenCV's rational model on normalised (x, y): (xd, yd) and the four entries of its Jacobian."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = k[4], k[5], k[6], k[7], k[8], k[9], k[10], k[11]
+    r2 = x * x + y * y
+    up = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    down = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = up / down
+    # d(radial) / d(r2), by the quotient rule
+    slope = (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3) - radial * (k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6))) / down
+    xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    xx = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+    xy = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+    yy = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+    return xd, yd, xx, xy, xy, yy
+
+
+@njit(cache=True, nogil=True)
+def normalise_kernel(u, v, k):  # type: ignore[no-untyped-def]
+    """Pixel to undistorted normalised (x, y) by Newton's method, and whether it converged."""
+    xd, yd = (u - k[2]) / k[0], (v - k[3]) / k[1]
+    if not k[4:12].any():
+        return xd, yd, True
+    x, y = xd, yd
+    for _ in range(50):
+        a, b, xx, xy, yx, yy = distort_kernel(x, y, k)
+        det = xx * yy - xy * yx
+        if not det > 1e-6:  # folded over: beyond the radius where the model is one-to-one
+            return x, y, False
+        ex, ey = a - xd, b - yd
+        x -= (yy * ex - xy * ey) / det
+        y -= (xx * ey - yx * ex) / det
+        if ex * ex + ey * ey < 1e-24:
+            return x, y, True
+    return x, y, False
+
+
+@njit(cache=True, nogil=True)
+def exp_kernel(w, out):  # type: ignore[no-untyped-def]
+    """Rodrigues' formula into `out` (3, 3)."""
+    x, y, z = w[0], w[1], w[2]
+    t2 = x * x + y * y + z * z
+    if t2 < 1e-8:  # series: both quotients lose digits near zero
+        a, b = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0
+    else:
+        t = math.sqrt(t2)
+        a, b = math.sin(t) / t, (1.0 - math.cos(t)) / t2
+    out[0, 0] = 1.0 - b * (y * y + z * z)
+    out[0, 1] = b * x * y - a * z
+    out[0, 2] = b * x * z + a * y
+    out[1, 0] = b * x * y + a * z
+    out[1, 1] = 1.0 - b * (x * x + z * z)
+    out[1, 2] = b * y * z - a * x
+    out[2, 0] = b * x * z - a * y
+    out[2, 1] = b * y * z + a * x
+    out[2, 2] = 1.0 - b * (x * x + y * y)
+
+
+@njit(cache=True, nogil=True)
+def project_kernel(points, rotation, position, k, px, jacobian, depth):  # type: ignore[no-untyped-def]
+    """Pixels (2K,), Jacobian (2K, 6) in the local increment, and depths (K,) of points (K, 3).
+
+    With Xc = Rt (P - p): dXc/dp = -Rt and, for R exp(dtheta), dXc/dtheta = [Xc]x.
+    """
+    for i in range(points.shape[0]):
+        dx = points[i, 0] - position[0]
+        dy = points[i, 1] - position[1]
+        dz = points[i, 2] - position[2]
+        xc = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
+        yc = rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz
+        zc = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
+        depth[i] = zc
+        inverse = 1.0 / zc if zc != 0.0 else math.inf
+        x, y = xc * inverse, yc * inverse
+        xd, yd, xx, xy, yx, yy = distort_kernel(x, y, k)
+        px[2 * i] = k[0] * xd + k[2]
+        px[2 * i + 1] = k[1] * yd + k[3]
+        for row in range(2):
+            f = k[row]
+            gx = f * (xx if row == 0 else yx) * inverse
+            gy = f * (xy if row == 0 else yy) * inverse
+            gz = -(gx * x + gy * y)
+            j = 2 * i + row
+            for axis in range(3):
+                jacobian[j, axis] = -(gx * rotation[axis, 0] + gy * rotation[axis, 1] + gz * rotation[axis, 2])
+            jacobian[j, 3] = gy * zc - gz * yc
+            jacobian[j, 4] = gz * xc - gx * zc
+            jacobian[j, 5] = gx * yc - gy * xc
