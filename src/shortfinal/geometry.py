@@ -295,7 +295,8 @@ def distort_kernel(x, y, k):  # type: ignore[no-untyped-def]
 def normalise_kernel(u, v, k):  # type: ignore[no-untyped-def]
     """Pixel to undistorted normalised (x, y) by Newton's method, and whether it converged."""
     xd, yd = (u - k[2]) / k[0], (v - k[3]) / k[1]
-    if not k[4:12].any():
+    ideal = k[4] == 0.0 and k[5] == 0.0 and k[6] == 0.0 and k[7] == 0.0 and k[8] == 0.0
+    if ideal and k[9] == 0.0 and k[10] == 0.0 and k[11] == 0.0:
         return xd, yd, True
     x, y = xd, yd
     for _ in range(50):

@@ -1,0 +1,1 @@
+"""Label files, crops and the scene renderer: foreign conventions are converted here and nowhere else."""

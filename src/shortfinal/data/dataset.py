@@ -1,0 +1,197 @@
+"""Rendered data sets: random approaches, drawn around the runway, with exact labels.
+
+On disk: `images/000000.png`, ... and `labels.csv`, one row a picture. Every row follows from the
+seed and its number alone, so an interrupted run continues where it stopped.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shortfinal.crops import bogo_crop, box_around
+from shortfinal.data.scene import random_scene, random_sensor, render
+from shortfinal.errors import InputError
+from shortfinal.geometry import Camera, Pose, project
+from shortfinal.runway import Runway
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+COLUMNS = (
+    "image", "width", "height", "fx", "fy", "cx", "cy", "length_m", "width_m",
+    "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg",
+    "near_left_u", "near_left_v", "near_right_u", "near_right_v",
+    "far_right_u", "far_right_v", "far_left_u", "far_left_v",
+)  # fmt: skip
+_CORNER_COLUMNS = COLUMNS[-8:]
+NAUTICAL_MILE_M = 1852.0
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """One picture and where the corners are in it."""
+
+    image: Image  # (h, w, 3) RGB
+    corners_px: Array  # (4, 2), keypoint order
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all: to a temporary name beside it, then renamed."""
+    partial = path.with_name(path.name + ".tmp")
+    partial.write_bytes(content)
+    partial.replace(path)
+
+
+def encode_png(image: Image) -> bytes:
+    """PNG bytes of an RGB picture (h, w, 3)."""
+    return bytes(cv2.imencode(".png", image[..., ::-1])[1])
+
+
+def random_approach(rng: np.random.Generator, runway: Runway) -> Pose:
+    """A camera in LARD's approach cone, somewhat widened (LARD, Ducoffe et al. 2023, table 1).
+
+    Slant distance 0.05 to 4.5 NM, log-uniform; glide angle 1.8 to 4.5 degrees at an apex 305 m past
+    the threshold; 5 degrees to either side; yaw, roll 12 degrees to either side, pitch -9 to 1.
+    """
+    distance = float(np.exp(rng.uniform(np.log(0.05), np.log(4.5)))) * NAUTICAL_MILE_M
+    lateral, glide = np.radians([rng.uniform(-5, 5), rng.uniform(1.8, 4.5)])
+    height = (distance + 305.0) * np.tan(glide)
+    attitude = rng.uniform([-12, -9, -12], [12, 1, 12])
+    return Pose.from_attitude([-distance, distance * np.tan(lateral), height], *attitude)
+
+
+def render_example(seed: int, index: int) -> tuple[Example, dict[str, object]]:
+    """Example number `index` of the data set `seed`, and its row.
+
+    The runway's box is 11 to 200 pixels long (log-uniform), as a camera sees it from afar or near; the
+    picture holds it with room for the training crop to move.
+    """
+    rng = np.random.default_rng([seed, index])
+    scene = random_scene(rng)
+    runway = Runway(scene.length, scene.width)
+    pose = random_approach(rng, runway)
+    unit = Camera(1, 1, 1000.0, 1000.0 * rng.uniform(0.9, 1.1), 0.0, 0.0)
+    box = box_around(project(unit, pose, runway.corners))
+    side = float(np.exp(rng.uniform(np.log(11.0), np.log(200.0))))
+    zoom = side / float((box[2:] - box[:2]).max())
+    camera = Camera(1, 1, unit.fx * zoom, unit.fy * zoom, 0.0, 0.0)
+    corners = project(camera, pose, runway.corners)
+    out = int(np.ceil(max(1.3 * side, min(1.9 * side, 235.0)))) + 2
+    window = bogo_crop(box_around(corners), out / side, out, rng, slack=0.06)
+    view = camera.view(window)
+    image = render(scene, view, pose, random_sensor(rng), samples=3, seed=int(rng.integers(2**31)))
+    corners = project(view, pose, runway.corners)
+    attitude = pose.attitude
+    values = [
+        f"images/{index:06d}.png", view.width, view.height, view.fx, view.fy, view.cx, view.cy,
+        runway.length_m, runway.width_m, *pose.position_m, *attitude, *corners.ravel(),
+    ]  # fmt: skip
+    return Example(image, corners), dict(zip(COLUMNS, values, strict=True))
+
+
+def write_dataset(
+    out: str | Path, count: int, seed: int = 0, workers: int | None = None, progress: Callable[[int], None] | None = None
+) -> Path:
+    """Render `count` examples into the folder `out`; pictures already there are kept.
+
+    Returns the path of labels.csv, which appears when all are done. Raises InputError if the folder
+    holds a data set of another seed.
+    """
+    folder = Path(out)
+    stamp = folder / "dataset.json"
+    if stamp.exists() and json.loads(stamp.read_text())["seed"] != seed:
+        raise InputError(f"{folder}: holds a data set of another seed; choose an empty folder or the same --seed")
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    stamp.write_text(json.dumps({"seed": seed}))
+
+    def one(index: int) -> dict[str, object]:
+        target = folder / f"images/{index:06d}.png"
+        record = target.with_suffix(".json")
+        if target.exists() and record.exists():
+            row: dict[str, object] = json.loads(record.read_text())
+        else:
+            example, row = render_example(seed, index)
+            row = {k: float(f"{v:.9g}") if isinstance(v, float) else v for k, v in row.items()}
+            replace_file(record, json.dumps(row).encode())
+            replace_file(target, encode_png(example.image))
+        if progress:
+            progress(index)
+        return row
+
+    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+        rows = list(pool.map(one, range(count)))
+    labels = folder / "labels.csv"
+    partial = labels.with_suffix(".tmp")
+    with partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+    partial.replace(labels)
+    for record in (folder / "images").glob("*.json"):
+        record.unlink()
+    return labels
+
+
+class RenderedDataset:
+    """The examples of a data set on disk, read when asked for."""
+
+    def __init__(self, folder: Path, names: list[str], corners_px: Array) -> None:
+        self.folder, self.names, self.corners_px = folder, names, corners_px
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> Example:
+        path = self.folder / self.names[index]
+        return Example(read_image(path), self.corners_px[index])
+
+
+def read_dataset(folder: str | Path) -> RenderedDataset:
+    """A data set written by `write_dataset`. Raises InputError naming the file, the line and the field."""
+    path = Path(folder) / "labels.csv"
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the labels: {error.strerror}; `shortfinal data render` writes them") from error
+    if not rows:
+        raise InputError(f"{path}: no rows")
+    missing = [c for c in ("image", *_CORNER_COLUMNS) if c not in rows[0]]
+    if missing:
+        raise InputError(f"{path}: lacks the columns {', '.join(missing)}")
+    corners = np.empty((len(rows), 8))
+    for number, row in enumerate(rows):
+        for column, name in enumerate(_CORNER_COLUMNS):
+            corners[number, column] = _number(path, number + 2, name, row[name])
+    return RenderedDataset(path.parent, [row["image"] for row in rows], corners.reshape(-1, 4, 2))
+
+
+def _number(path: Path, line: int, field: str, text: str) -> float:
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        value = float("nan")
+    if not np.isfinite(value):
+        raise InputError(f"{path}: line {line}: {field} is {text!r}; it must be a finite number")
+    return value
+
+
+def read_image(path: str | Path) -> Image:
+    """An image file as RGB (h, w, 3) uint8. Raises InputError if it is missing or no image."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such image")
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise InputError(f"{path}: cannot be read as an image")
+    return np.ascontiguousarray(image[..., ::-1])

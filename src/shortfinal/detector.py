@@ -1,0 +1,162 @@
+"""The network at run time: an image and a crop in, Gaussian keypoints out. ONNX Runtime, no torch.
+
+The only preprocessing code of the package: training uses `crop_image` and `normalise` from here.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, fields
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shortfinal.errors import InputError
+from shortfinal.geometry import PixelWindow
+from shortfinal.keypoints import GaussianKeypoints
+
+Image = NDArray[np.uint8]
+
+METADATA_KEY = "shortfinal"
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """What a model file says of itself, as JSON in the ONNX metadata."""
+
+    format: int  # version of this description
+    size: int  # side of the square input, px
+    mean: tuple[float, float, float]  # subtracted from RGB / 255
+    std: tuple[float, float, float]  # then divided by
+    keypoints: tuple[str, ...]  # names, in order
+    covariance: str  # "diagonal": what the network predicts of the (2K, 2K) covariance it returns
+    margin: float  # the crop it works best with: side of the crop over longer side of the runway's box
+    backbone: str
+    training: dict[str, Any]  # data, steps, seed
+    figures: dict[str, float]  # errors (px of the input) and coverage on the held-out scenes
+
+    @classmethod
+    def from_json(cls, text: str, source: str) -> ModelInfo:
+        """Parse and check. Raises InputError naming the field that is missing or of another format."""
+        try:
+            content = json.loads(text)
+            values = {f.name: content[f.name] for f in fields(cls)}
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{source}: its shortfinal description lacks {error}; export it again") from error
+        if values["format"] != FORMAT:
+            raise InputError(f"{source}: description format {values['format']}; this version reads {FORMAT}")
+        for name in ("mean", "std", "keypoints"):
+            values[name] = tuple(values[name])
+        return cls(**values)
+
+    def to_json(self) -> str:
+        """The text `from_json` reads."""
+        return json.dumps(asdict(self))
+
+
+class KeypointDetector:
+    """A model file, loaded. `detect` turns an image and a crop into keypoints in the image's pixels."""
+
+    def __init__(self, path: str | Path | None = None, threads: int = 0) -> None:
+        """Load `path`, or the model that ships with the package. `threads`: 0 for all cores.
+
+        Raises InputError if the file is missing, is no ONNX model, or does not describe itself.
+        """
+        self._session, self.info = _load(path, threads)
+
+    def detect(self, image: Image, window: PixelWindow) -> GaussianKeypoints:
+        """Keypoints in the pixels of `image` (h, w, 3; RGB, uint8), found within `window`.
+
+        The window must have the model's input size. Raises InputError for another image type or
+        window, and when the network's answer is not a Gaussian (non-finite).
+        """
+        check_image(image)
+        if (window.out_width, window.out_height) != (self.info.size, self.info.size):
+            raise InputError(
+                f"window: {window.out_width} x {window.out_height}; the model takes {self.info.size} x {self.info.size}"
+            )
+        batch = normalise(crop_image(image, window), self.info.mean, self.info.std)[None]
+        mean, cov = (np.asarray(out[0], np.float64) for out in self._session.run(["mean_px", "cov_px"], {"image": batch}))
+        return GaussianKeypoints(window.inverse(mean), window.inverse_cov(cov))
+
+
+def check_image(image: Image) -> None:
+    """Raises InputError unless `image` is (h, w, 3), uint8, and not empty."""
+    if not (isinstance(image, np.ndarray) and image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8):
+        shape = getattr(image, "shape", type(image).__name__)
+        raise InputError(f"image: expected (height, width, 3) uint8 RGB, got {shape} {getattr(image, 'dtype', '')}")
+    if image.size == 0:
+        raise InputError(f"image: empty, {image.shape}")
+
+
+def crop_image(image: Image, window: PixelWindow) -> Image:
+    """The window's pixels (out_height, out_width, 3); black beyond the image's border.
+
+    Shrinking by two or more averages whole blocks first, so nothing aliases; then bilinear.
+    """
+    shrink = [max(1, math.floor(1.0 / s)) for s in window.scale]
+    if max(shrink) > 1:
+        image, window = _shrunk(image, window, shrink[0], shrink[1])
+    sx, sy = window.scale
+    # Output pixel to source pixel: PixelWindow.inverse, as a matrix.
+    matrix = np.array([[1 / sx, 0, 0.5 / sx + window.left - 0.5], [0, 1 / sy, 0.5 / sy + window.top - 0.5]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    out = cv2.warpAffine(image, matrix, (window.out_width, window.out_height), flags=flags, borderMode=cv2.BORDER_CONSTANT)
+    return np.asarray(out, np.uint8)
+
+
+def _shrunk(image: Image, window: PixelWindow, kx: int, ky: int) -> tuple[Image, PixelWindow]:
+    """Block averages of the part of the image that the window needs, and the window upon them."""
+    height, width = image.shape[:2]
+    x0, y0 = max(0, math.floor(window.left) - kx), max(0, math.floor(window.top) - ky)
+    x1 = min(width, math.ceil(window.left + window.width) + kx)
+    y1 = min(height, math.ceil(window.top + window.height) + ky)
+    columns, rows = max(0, x1 - x0) // kx, max(0, y1 - y0) // ky
+    if columns == 0 or rows == 0:
+        black = np.zeros((1, 1, 3), np.uint8)
+        return black, PixelWindow(10.0, 10.0, window.width, window.height, window.out_width, window.out_height)
+    part = image[y0 : y0 + rows * ky, x0 : x0 + columns * kx]
+    small = cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA)
+    moved = PixelWindow(
+        (window.left - x0) / kx, (window.top - y0) / ky, window.width / kx, window.height / ky,
+        window.out_width, window.out_height,
+    )  # fmt: skip
+    return np.asarray(small, np.uint8), moved
+
+
+def normalise(crop: Image, mean: tuple[float, ...], std: tuple[float, ...]) -> NDArray[np.float32]:
+    """RGB (h, w, 3) uint8 to the network's input (3, h, w): (RGB / 255 - mean) / std."""
+    scaled = (crop.astype(np.float32) / 255.0 - np.float32(mean)) / np.float32(std)
+    return np.ascontiguousarray(scaled.transpose(2, 0, 1))
+
+
+@cache
+def shipped_model() -> Path:
+    """The model file inside the package."""
+    return Path(str(files("shortfinal") / "models" / "runway.onnx"))
+
+
+def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo]:
+    import onnxruntime
+
+    source = Path(path) if path is not None else shipped_model()
+    if not source.is_file():
+        raise InputError(f"{source}: no such model file")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    try:
+        session = onnxruntime.InferenceSession(str(source), options, providers=onnxruntime.get_available_providers())
+    except Exception as error:  # ONNX Runtime has no common base class for what a broken file raises
+        raise InputError(f"{source}: not an ONNX model: {str(error).splitlines()[0][:120]}") from error
+    text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+    if text is None:
+        raise InputError(f"{source}: an ONNX model, but not one of ours: no {METADATA_KEY!r} metadata; see `shortfinal export`")
+    return session, ModelInfo.from_json(text, str(source))

@@ -1,0 +1,146 @@
+"""One frame in; where the runway is, where the camera is, and whether to believe it, out."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from shortfinal.crops import box_around, centre_crop
+from shortfinal.detector import Image, KeypointDetector, check_image
+from shortfinal.errors import InputError
+from shortfinal.geometry import Camera, PixelWindow, Pose, project
+from shortfinal.integrity import Decision, IntegrityVerdict, check_integrity
+from shortfinal.keypoints import GaussianKeypoints
+from shortfinal.pose import PoseEstimate, estimate_pose
+from shortfinal.runway import Runway
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameResult:
+    """All that is known of one frame. What could not be done is None, and `verdict.reasons` says why."""
+
+    timestamp_s: float
+    crop: PixelWindow | None  # where the detector looked
+    keypoints: GaussianKeypoints | None  # in the frame's pixels
+    estimate: PoseEstimate | None
+    verdict: IntegrityVerdict
+    timings_ms: dict[str, float] = field(default_factory=dict)  # stage -> duration
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON. Lengths in metres, angles in degrees, pixels of the frame."""
+        record: dict[str, Any] = {
+            "timestamp_s": self.timestamp_s,
+            "decision": self.verdict.decision.value,
+            "reasons": list(self.verdict.reasons),
+            "statistic": self.verdict.statistic,
+            "dof": self.verdict.dof,
+            "p_value": self.verdict.p_value,
+            "timings_ms": {stage: round(ms, 3) for stage, ms in self.timings_ms.items()},
+        }
+        if self.crop is not None:
+            record["crop"] = [self.crop.left, self.crop.top, self.crop.width, self.crop.height]
+        if self.keypoints is not None:
+            record["keypoints_px"] = self.keypoints.mean_px.tolist()
+            record["keypoints_cov_px"] = self.keypoints.cov_px.tolist()
+        if self.estimate is not None:
+            record["status"] = self.estimate.status.value
+        if self.estimate is not None and self.estimate.pose is not None and self.estimate.cov is not None:
+            record["position_m"] = self.estimate.pose.position_m.tolist()
+            record["attitude_deg"] = list(self.estimate.pose.attitude)
+            record["pose_cov"] = self.estimate.cov.tolist()
+        return record
+
+
+class LandingPipeline:
+    """Crop, detect, solve, doubt: one runway, one camera, frame after frame.
+
+    Where to look comes with each frame: a box around the runway, or a prior pose (GNSS/INS), or
+    else the last frame whose pose was accepted. Frames must be of the camera's size.
+    """
+
+    def __init__(
+        self, detector: KeypointDetector, runway: Runway, camera: Camera, *, false_alarm_rate: float = 1e-3
+    ) -> None:
+        self.detector, self.runway, self.camera = detector, runway, camera
+        self.false_alarm_rate = false_alarm_rate
+        self._last: Pose | None = None
+
+    def step(
+        self,
+        frame_rgb: Image,
+        timestamp_s: float = 0.0,
+        *,
+        box: ArrayLike | None = None,
+        prior: Pose | None = None,
+        alter: Callable[[GaussianKeypoints], GaussianKeypoints] | None = None,
+    ) -> FrameResult:
+        """Process one frame (height, width, 3; RGB, uint8).
+
+        `box` (4,): left, top, right, bottom in pixels; `prior`: a pose near enough to see the runway
+        within the crop's margin. `alter` changes the keypoints before they are used: for injecting
+        faults. Raises InputError for a frame of another size or type or a timestamp that is not
+        finite; whatever fails after that is a verdict of NOT_MONITORED with its reason.
+        """
+        check_image(frame_rgb)
+        if frame_rgb.shape[:2] != (self.camera.height, self.camera.width):
+            raise InputError(
+                f"frame: {frame_rgb.shape[1]} x {frame_rgb.shape[0]} pixels; "
+                f"the camera has {self.camera.width} x {self.camera.height}"
+            )
+        if not math.isfinite(timestamp_s):
+            raise InputError(f"timestamp_s: {timestamp_s}; it must be finite")
+        timings: dict[str, float] = {}
+        crop: PixelWindow | None = None
+        keypoints: GaussianKeypoints | None = None
+        try:
+            crop = self._crop(box, prior)
+            with_crop = crop
+            keypoints = _timed(timings, "detect", lambda: self.detector.detect(frame_rgb, with_crop))
+            keypoints = alter(keypoints) if alter else keypoints
+        except InputError as error:
+            verdict = IntegrityVerdict(Decision.NOT_MONITORED, (str(error),), 0, self.false_alarm_rate)
+            return FrameResult(timestamp_s, crop, keypoints, None, verdict, timings)
+        estimate, verdict = self.judge(keypoints, timings)
+        return FrameResult(timestamp_s, crop, keypoints, estimate, verdict, timings)
+
+    def judge(
+        self, keypoints: GaussianKeypoints, timings: dict[str, float] | None = None
+    ) -> tuple[PoseEstimate, IntegrityVerdict]:
+        """Solve and doubt: from keypoints in the frame's pixels, whoever found them."""
+        timings = {} if timings is None else timings
+        estimate = _timed(timings, "solve", lambda: estimate_pose(keypoints, self.runway.corners, self.camera))
+        verdict = _timed(timings, "doubt", lambda: check_integrity(estimate, self.false_alarm_rate))
+        if verdict.decision is Decision.USE:
+            self._last = estimate.pose
+        return estimate, verdict
+
+    def _crop(self, box: ArrayLike | None, prior: Pose | None) -> PixelWindow:
+        if box is None:
+            near = prior or self._last
+            if near is None:
+                raise InputError("where to look is not known: no box, no prior pose, and no earlier frame was accepted")
+            box = box_around(project(self.camera, near, self.runway.corners))
+        bounds = np.asarray(box, float)
+        outside = bounds.shape == (4,) and (
+            (bounds[2:] < 0).any() or bounds[0] >= self.camera.width or bounds[1] >= self.camera.height
+        )
+        if outside:
+            raise InputError(f"the runway's box {np.round(bounds).tolist()} lies outside the frame")
+        return centre_crop(bounds, self.detector.info.margin, self.detector.info.size)
+
+
+def _timed(timings: dict[str, float], stage: str, work: Callable[[], T]) -> T:
+    start = time.perf_counter()
+    try:
+        return work()
+    finally:
+        timings[stage] = 1e3 * (time.perf_counter() - start)

@@ -1,0 +1,278 @@
+"""`shortfinal train`: fit a KeypointNet to a rendered data set, resumable at any moment."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.utils.data import DataLoader, Dataset
+
+from shortfinal.crops import bogo_crop, box_around, centre_crop
+from shortfinal.data.dataset import Example, read_dataset
+from shortfinal.detector import crop_image, normalise
+from shortfinal.errors import InputError
+from shortfinal.geometry import PixelWindow
+from shortfinal.train.model import KeypointNet, gaussian_nll, to_pixels, variance_px
+
+Batch = tuple[Tensor, Tensor]
+
+MEAN, STD = (0.45, 0.45, 0.45), (0.22, 0.22, 0.22)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How to train. Everything that the result depends on, besides the data."""
+
+    data: str  # folder of the training scenes
+    validation: str  # folder of the held-out scenes
+    out: str  # folder of the checkpoints
+    backbone: str = "mobilenetv3_small_100"  # any timm model with features_only
+    width: int = 96  # channels of the head
+    size: int = 224  # side of the crop, px
+    margin: float = 1.4  # of the evaluation crop; training draws from 1.15 to 1.9
+    batch: int = 32
+    steps: int = 15000
+    warm_up: float = 0.1  # share of the steps before the variance enters the mean's loss
+    learning_rate: float = 2e-3
+    weight_decay: float = 0.02
+    ema: float = 0.998
+    validate_every: int = 500  # steps
+    validation_count: int = 1000
+    workers: int = 1
+    seed: int = 0
+
+
+def augment(crop: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Photometric changes only: they leave the labels as they are."""
+    gamma = np.exp(rng.normal(0, 0.2))
+    gain, offset = np.exp(rng.normal(0, 0.15, 3) * 0.5 + rng.normal(0, 0.15)), rng.normal(0, 8)
+    levels = (np.arange(256) / 255.0) ** gamma
+    table = np.clip(255 * levels[:, None] * gain + offset, 0, 255).astype(np.uint8)
+    crop = np.asarray(cv2.LUT(crop, table[None]), np.uint8)
+    if rng.random() < 0.3:  # towards grey, or with the channels mixed
+        mix = rng.uniform(0, 1) * rng.dirichlet([1, 1, 1], 3)
+        mix += np.diag(1 - mix.sum(axis=1))
+        crop = np.asarray(cv2.transform(crop, mix), np.uint8)
+    if rng.random() < 0.2:
+        crop = np.asarray(cv2.GaussianBlur(crop, (0, 0), rng.uniform(0.5, 2.0)), np.uint8)
+    if rng.random() < 0.2:
+        grain = rng.normal(0, rng.uniform(1, 8), crop.shape)
+        crop = np.clip(crop + grain, 0, 255).astype(np.uint8)
+    return crop
+
+
+def training_crop(example: Example, size: int, rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """A random crop (size, size, 3) of an example, and its corners (4, 2); half of them mirrored."""
+    height, width = example.image.shape[:2]
+    box = box_around(example.corners_px)
+    side = (box[2:] - box[:2]).max()
+    margin = rng.uniform(1.15, max(1.2, min(1.9, min(width, height) / side)))
+    window = bogo_crop(box, margin, size, rng, slack=0.02)
+    if rng.random() < 0.95:  # else the crop may hang over the image's border
+        left = float(np.clip(window.left, 0, max(0.0, width - window.width)))
+        top = float(np.clip(window.top, 0, max(0.0, height - window.height)))
+        window = PixelWindow(left, top, window.width, window.height, size, size)
+    crop, corners = crop_image(example.image, window), window.apply(example.corners_px)
+    if rng.random() < 0.5:
+        crop = np.ascontiguousarray(crop[:, ::-1])
+        corners = (corners * [-1, 1] + [size - 1, 0])[[1, 0, 3, 2]]  # left and right change places
+    return crop, corners
+
+
+class _Draws(Dataset[Batch]):
+    """Draw number n of the training run: a function of the seed and n, so that resuming is exact."""
+
+    def __init__(self, recipe: Recipe, start: int) -> None:
+        self.examples = read_dataset(recipe.data)
+        self.recipe, self.start = recipe, start
+
+    def __len__(self) -> int:
+        return (self.recipe.steps * self.recipe.batch) - self.start
+
+    def __getitem__(self, index: int) -> Batch:
+        rng = np.random.default_rng([self.recipe.seed, 1, self.start + index])
+        crop, corners = training_crop(self.examples[int(rng.integers(len(self.examples)))], self.recipe.size, rng)
+        image = normalise(augment(crop, rng), MEAN, STD)
+        return torch.from_numpy(image), torch.from_numpy(corners.astype(np.float32))
+
+
+class _Held(Dataset[Batch]):
+    """The held-out scenes, cropped at the centre."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.examples = read_dataset(recipe.validation)
+        self.recipe = recipe
+
+    def __len__(self) -> int:
+        return min(len(self.examples), self.recipe.validation_count)
+
+    def __getitem__(self, index: int) -> Batch:
+        example = self.examples[index]
+        window = centre_crop(box_around(example.corners_px), self.recipe.margin, self.recipe.size)
+        image = normalise(crop_image(example.image, window), MEAN, STD)
+        return torch.from_numpy(image), torch.from_numpy(window.apply(example.corners_px).astype(np.float32))
+
+
+def validate(model: torch.nn.Module, batches: DataLoader[Batch], size: int) -> dict[str, float]:
+    """Errors in pixels of the crop, per coordinate, and how honest the predicted sigma is."""
+    model.eval()
+    errors, variances = [], []
+    with torch.inference_mode():
+        for image, corners in batches:
+            mean, log_variance = model(image.contiguous(memory_format=torch.channels_last))
+            errors.append(to_pixels(mean, size) - corners)
+            variances.append(variance_px(log_variance))
+    error, sigma = torch.cat(errors), torch.cat(variances).sqrt()
+    size_of = error.abs()
+    ratio = size_of / sigma
+    return {
+        "nll": float((0.5 * ratio.square() + sigma.log()).mean()),
+        "median_px": float(size_of.median()),
+        "p90_px": float(size_of.flatten().quantile(0.9)),
+        "mean_px": float(size_of.mean()),
+        "far_median_px": float(size_of[:, 2:].median()),
+        "coverage_68": float((ratio < 0.99446).float().mean()),  # normal quantiles of 68 and 95 %
+        "coverage_95": float((ratio < 1.95996).float().mean()),
+    }
+
+
+class Run:
+    """A training run: its parts, its place on disk, and how to go on from there."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe, self.folder = recipe, Path(recipe.out)
+        torch.manual_seed(recipe.seed)
+        self.model: torch.nn.Module = KeypointNet(recipe.backbone, width=recipe.width).to(memory_format=torch.channels_last)
+        self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema), use_buffers=True)
+        self.optimizer = torch.optim.AdamW(
+            self.model.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay
+        )
+        self.schedule = torch.optim.lr_scheduler.OneCycleLR(
+            self.optimizer, recipe.learning_rate, total_steps=recipe.steps + 1, pct_start=0.08
+        )
+        self.step, self.best = 0, float("inf")
+
+    def save(self, name: str) -> None:
+        """Write a checkpoint whole or not at all."""
+        parts = {p: getattr(self, p).state_dict() for p in ("model", "average", "optimizer", "schedule")}
+        state = parts | {"step": self.step, "best": self.best, "recipe": asdict(self.recipe)}
+        partial = self.folder / f"{name}.tmp"
+        torch.save(state, partial)
+        partial.replace(self.folder / name)
+
+    def resume(self) -> bool:
+        """Go on from last.pt, if there is one. Raises InputError if it was made by another recipe."""
+        path = self.folder / "last.pt"
+        if not path.exists():
+            return False
+        state = load_checkpoint(path)
+        was, now = state["recipe"], asdict(self.recipe)
+        changed = [k for k in now if was.get(k) != now[k] and k not in ("data", "validation", "out", "workers")]
+        if changed:
+            raise InputError(f"{path}: was made with another {', '.join(changed)}; choose another --out")
+        for part in ("model", "average", "optimizer", "schedule"):
+            getattr(self, part).load_state_dict(state[part])
+        self.step, self.best = state["step"], state["best"]
+        return True
+
+    def advance(self, image: Tensor, corners: Tensor) -> float:
+        """One step of the optimiser; returns the loss."""
+        self.model.train()
+        mean, log_variance = self.model(image.contiguous(memory_format=torch.channels_last))
+        error = to_pixels(mean, self.recipe.size) - corners
+        if self.step < self.recipe.warm_up * self.recipe.steps:
+            # Means first: while they are far off, the variance would only learn to excuse them.
+            loss = 0.1 * error.abs().mean() + gaussian_nll(error.detach(), log_variance)
+        else:
+            loss = gaussian_nll(error, log_variance)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), 5.0)
+        self.optimizer.step()
+        self.schedule.step()
+        self.average.update_parameters(self.model)
+        self.step += 1
+        return float(loss.detach())
+
+
+def load_checkpoint(path: str | Path) -> dict[str, Any]:
+    """The content of a checkpoint. Raises InputError if it is missing or not one of ours."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the checkpoint: {error.strerror}") from error
+    except Exception as error:  # torch raises many kinds for a file that is not a checkpoint
+        raise InputError(f"{path}: not a checkpoint: {str(error).splitlines()[0][:120]}") from error
+    if not isinstance(state, dict) or "recipe" not in state:
+        raise InputError(f"{path}: a torch file, but not a checkpoint of shortfinal train")
+    return state
+
+
+def train(recipe: Recipe, console: Console | None = None) -> dict[str, float]:
+    """Train, or go on training; returns the figures of the best checkpoint (out/best.pt).
+
+    Keeps out/last.pt for resuming and out/log.csv, a row at each validation.
+    """
+    console = console or Console()
+    folder = Path(recipe.out)
+    folder.mkdir(parents=True, exist_ok=True)
+    run = Run(recipe)
+    if run.resume():
+        console.print(f"going on from step {run.step}")
+    held = DataLoader(_Held(recipe), batch_size=64)
+    draws = _Draws(recipe, run.step * recipe.batch)
+    batches: Iterator[Batch] = iter(DataLoader(draws, batch_size=recipe.batch, num_workers=recipe.workers))
+    figures: dict[str, float] = {}
+    with _bar(console) as bar:
+        task = bar.add_task("training", total=recipe.steps, completed=run.step, note="")
+        smooth = float("nan")
+        for image, corners in batches:
+            loss = run.advance(image, corners)
+            smooth = loss if smooth != smooth else 0.98 * smooth + 0.02 * loss
+            bar.update(task, completed=run.step, note=f"loss {smooth:.3f}" + _brief(figures))
+            if run.step % recipe.validate_every == 0 or run.step == recipe.steps:
+                figures = validate(run.average, held, recipe.size)
+                _log(folder / "log.csv", {"step": run.step, "loss": smooth, **figures})
+                if figures["nll"] < run.best:
+                    run.best = figures["nll"]
+                    run.save("best.pt")
+                    partial = folder / "best.tmp"
+                    partial.write_text(json.dumps(figures, indent=1))
+                    partial.replace(folder / "best.json")
+                run.save("last.pt")
+    best: dict[str, float] = json.loads((folder / "best.json").read_text())
+    return best
+
+
+def _bar(console: Console) -> Progress:
+    columns = (BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"))
+    return Progress(*columns, console=console)
+
+
+def _brief(figures: dict[str, float]) -> str:
+    return f" · held out: median {figures['median_px']:.2f} px, nll {figures['nll']:.3f}" if figures else ""
+
+
+def _log(path: Path, row: dict[str, float]) -> None:
+    """Append a row and flush it, so that the log survives a kill."""
+    new = not path.exists()
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, row.keys())
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+        file.flush()
+        os.fsync(file.fileno())
