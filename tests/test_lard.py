@@ -251,7 +251,6 @@ def test_whole_pixels_are_nearest_not_half_a_pixel_off():
     error, variance = np.array(off).T
     mean = np.average(error, weights=1 / variance)
     standard_error = np.degrees(1 / np.sqrt((1 / variance).sum()))
-    print(f"pitch off by {mean:.4f} degrees, standard error {standard_error:.4f}")
     half_pixel = np.degrees(0.5 / EARTH_STUDIO.fy)
     assert abs(mean) < half_pixel / 2
     assert standard_error < half_pixel / 4

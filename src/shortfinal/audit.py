@@ -26,6 +26,7 @@ from scipy.special import chdtrc, chdtri, chndtr, chndtrinc, ndtri
 
 from shortfinal.data.lard import RunwayLabel, read_labels
 from shortfinal.errors import InputError
+from shortfinal.files import make_folder, write_whole
 from shortfinal.geometry import Camera, project
 from shortfinal.integrity import Decision, check_integrity
 from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
@@ -40,7 +41,8 @@ Array = NDArray[np.float64]
 
 # One row in a thousand named by chance: about one in LARD's test set, against faults of some per cent.
 FALSE_ALARM_RATE = 1e-3
-# Beside what the solve and the rounding explain: runway and focal length are known to some 0.1 %.
+# Beside what sigma and rounding explain: a margin, by choice, for the surveyed runway and the focal length.
+# LARD's own labels need none of it.
 DISTANCE_ALLOWANCE = 0.002
 POWER = 0.99  # the chance of being found by which the blind spots are drawn
 SHIFT_PX = 5.0  # a slip of the hand, as the share missed is told for
@@ -50,7 +52,7 @@ _DIRECTIONS = 16
 class Finding(Enum):
     """What speaks against a label."""
 
-    UNSOLVABLE = "unsolvable"  # no physical pose shows the runway like this
+    UNSOLVABLE = "unsolvable"  # the solver found no physical pose that shows the runway like this
     ORDER = "order"  # the columns' order is broken, or the corners do not go round the runway
     RESIDUAL = "residual"  # χ² rejects: the four corners do not fit the runway from any pose
     DISTANCE = "distance"  # the solved distance and the recorded one differ beyond the tolerance
@@ -186,8 +188,8 @@ def audit_labels(
     """
     if sigma_px is not None and not (math.isfinite(sigma_px) and sigma_px > 0):
         raise InputError(f"sigma_px: got {sigma_px}; it must be finite and > 0")
-    if not 0 < false_alarm_rate < 1:
-        raise InputError(f"false_alarm_rate: got {false_alarm_rate}; it must lie between 0 and 1")
+    if not 0 < false_alarm_rate < POWER:
+        raise InputError(f"false_alarm_rate: got {false_alarm_rate}; it must lie between 0 and {POWER:g}")
     runways = {ident: _look_up(database, ident) for ident in {label.ident for label in labels}}
     audited = [
         _audit(
@@ -275,7 +277,8 @@ def _blind_spots(estimate: PoseEstimate, rate: float) -> tuple[tuple[float, ...]
     blocks = leftover.reshape(-1, len(CORNER_NAMES), 2).transpose(1, 0, 2)
     # The direction that hides a corner's shift best is the last right singular vector of its block.
     weakest = np.linalg.svd(blocks, compute_uv=False)[:, -1]
-    smallest = np.sqrt(needed) / np.maximum(weakest, np.finfo(float).tiny)
+    seen = weakest > 1e-10 * np.linalg.norm(whitening, 2)  # else rounding is all that is left
+    smallest = np.divide(math.sqrt(needed), weakest, out=np.full(len(CORNER_NAMES), math.inf), where=seen)
     noncentrality = np.sum((blocks @ shifts.T) ** 2, axis=1)
     missed = float(chndtr(threshold, estimate.dof, noncentrality).mean())
     return tuple(float(px) for px in smallest), missed
@@ -304,24 +307,14 @@ def write_report(report: AuditReport, out_dir: str | Path) -> None:
 
     Raises InputError if the folder cannot be made or written to.
     """
-    folder = Path(out_dir)
-    contents = {
-        "audit.csv": _table(report).encode(),
-        "audit.json": json.dumps(report_as_dict(report), indent=1, allow_nan=False).encode(),
-        "audit.png": _picture(report),
-    }
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, content in contents.items():
-            partial = folder / f"{name}.tmp"
-            partial.write_bytes(content)
-            partial.replace(folder / name)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot write the report there: {error.strerror}") from error
+    folder = make_folder(out_dir)
+    write_whole(folder / "audit.csv", _table(report))
+    write_whole(folder / "audit.json", json.dumps(report_as_dict(report), indent=1, allow_nan=False))
+    write_whole(folder / "audit.png", _picture(report))
 
 
 def report_as_dict(report: AuditReport) -> dict[str, Any]:
-    """The report as JSON takes it; a number that could not be computed is None."""
+    """The report as JSON takes it; a number that is infinite or could not be computed is None."""
     return {
         "source": report.source,
         "sigma_px": report.sigma_px,
@@ -356,7 +349,7 @@ def _row(audited: AuditedLabel) -> dict[str, Any]:
         "statistic": _finite(audited.statistic),
         "reprojection_px": _finite(audited.reprojection_px),
         "distance_m": _finite(audited.distance_m),
-        "recorded_m": label.distance_m,
+        "recorded_m": _finite(label.distance_m),
         "distance_error_m": _finite(audited.distance_error_m),
         "distance_tolerance_m": _finite(audited.distance_tolerance_m),
         **{f"smallest_found_px_{name.replace('-', '_')}": _finite(px) for name, px in corners.items()},
@@ -365,8 +358,8 @@ def _row(audited: AuditedLabel) -> dict[str, Any]:
     }
 
 
-def _finite(value: float) -> float | None:
-    return float(f"{value:.6g}") if math.isfinite(value) else None
+def _finite(value: float | None) -> float | None:
+    return float(f"{value:.6g}") if value is not None and math.isfinite(value) else None
 
 
 def _table(report: AuditReport) -> str:
@@ -432,7 +425,10 @@ def _number(value: float | None, form: str) -> str:
 def _limits(report: AuditReport) -> RenderableType:
     from rich.text import Text
 
+    sigmas = sorted({report.sigma_px or a.label.rounding_sigma_px for a in report.labels})
     lines = [
+        f"Held against sigma {', '.join(f'{s:.3g}' for s in sigmas)} px, "
+        f"with a false-alarm rate of {report.false_alarm_rate:g} a label.",
         f"By chance, χ² names {report.expected_false_alarms:.1f} good labels and the distance at most as many again.",
         f"The residuals of the passed labels are {_number(report.sigma_ratio, '.2f')} times what sigma predicts.",
         f"Not seen: a single corner shifted by less than this is not found with {POWER:.0%} in its worst direction",

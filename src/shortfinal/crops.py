@@ -37,7 +37,9 @@ def bogo_crop(box: ArrayLike, margin: float, size: int, rng: np.random.Generator
     bounds = as_array(box, (4,), "box") + 0.5
     keep = slack * side
     lowest, highest = bounds[2:] - side + keep, bounds[:2] - keep
-    corner = np.where(lowest < highest, rng.uniform(np.minimum(lowest, highest), np.maximum(lowest, highest)), [left, top])
+    corner = np.where(
+        lowest < highest, rng.uniform(np.minimum(lowest, highest), np.maximum(lowest, highest)), [left, top]
+    )
     return PixelWindow(float(corner[0]), float(corner[1]), side, side, size, size)
 
 

@@ -83,7 +83,9 @@ class KeypointDetector:
                 f"window: {window.out_width} x {window.out_height}; the model takes {self.info.size} x {self.info.size}"
             )
         batch = normalise(crop_image(image, window), self.info.mean, self.info.std)[None]
-        mean, cov = (np.asarray(out[0], np.float64) for out in self._session.run(["mean_px", "cov_px"], {"image": batch}))
+        mean, cov = (
+            np.asarray(out[0], np.float64) for out in self._session.run(["mean_px", "cov_px"], {"image": batch})
+        )
         return GaussianKeypoints(window.inverse(mean), window.inverse_cov(cov))
 
 
@@ -108,7 +110,9 @@ def crop_image(image: Image, window: PixelWindow) -> Image:
     # Output pixel to source pixel: PixelWindow.inverse, as a matrix.
     matrix = np.array([[1 / sx, 0, 0.5 / sx + window.left - 0.5], [0, 1 / sy, 0.5 / sy + window.top - 0.5]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    out = cv2.warpAffine(image, matrix, (window.out_width, window.out_height), flags=flags, borderMode=cv2.BORDER_CONSTANT)
+    out = cv2.warpAffine(
+        image, matrix, (window.out_width, window.out_height), flags=flags, borderMode=cv2.BORDER_CONSTANT
+    )
     return np.asarray(out, np.uint8)
 
 
@@ -133,7 +137,7 @@ def _shrunk(image: Image, window: PixelWindow, kx: int, ky: int) -> tuple[Image,
 
 def normalise(crop: Image, mean: tuple[float, ...], std: tuple[float, ...]) -> NDArray[np.float32]:
     """RGB (h, w, 3) uint8 to the network's input (3, h, w): (RGB / 255 - mean) / std."""
-    scaled = (crop.astype(np.float32) / 255.0 - np.float32(mean)) / np.float32(std)
+    scaled = (crop.astype(np.float32) / np.float32(255) - np.array(mean, np.float32)) / np.array(std, np.float32)
     return np.ascontiguousarray(scaled.transpose(2, 0, 1))
 
 
@@ -158,5 +162,7 @@ def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo]:
         raise InputError(f"{source}: not an ONNX model: {str(error).splitlines()[0][:120]}") from error
     text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
     if text is None:
-        raise InputError(f"{source}: an ONNX model, but not one of ours: no {METADATA_KEY!r} metadata; see `shortfinal export`")
+        raise InputError(
+            f"{source}: an ONNX model, but not one of ours: no {METADATA_KEY!r} metadata; see `shortfinal export`"
+        )
     return session, ModelInfo.from_json(text, str(source))

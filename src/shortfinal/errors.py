@@ -1,4 +1,4 @@
-"""The one exception for wrong input."""
+"""The two ways a call can fail on purpose."""
 
 
 class InputError(ValueError):
@@ -6,3 +6,7 @@ class InputError(ValueError):
 
     The command line prints it and exits with status 2; a library user catches it as a ValueError.
     """
+
+
+class JobError(RuntimeError):
+    """The input was right, but the job failed; the command line exits with status 1."""

@@ -273,7 +273,7 @@ def _rotation_z(a: float) -> Array:
 # `project` draws. Scalars and caller-owned arrays only: nothing is allocated per call.
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def distort_kernel(x, y, k):  # type: ignore[no-untyped-def]
     """OpenCV's rational model on normalised (x, y): (xd, yd) and the four entries of its Jacobian."""
     k1, k2, p1, p2, k3, k4, k5, k6 = k[4], k[5], k[6], k[7], k[8], k[9], k[10], k[11]
@@ -291,7 +291,7 @@ def distort_kernel(x, y, k):  # type: ignore[no-untyped-def]
     return xd, yd, xx, xy, xy, yy
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def normalise_kernel(u, v, k):  # type: ignore[no-untyped-def]
     """Pixel to undistorted normalised (x, y) by Newton's method, and whether it converged."""
     xd, yd = (u - k[2]) / k[0], (v - k[3]) / k[1]
@@ -312,7 +312,7 @@ def normalise_kernel(u, v, k):  # type: ignore[no-untyped-def]
     return x, y, False
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def exp_kernel(w, out):  # type: ignore[no-untyped-def]
     """Rodrigues' formula into `out` (3, 3)."""
     x, y, z = w[0], w[1], w[2]
@@ -333,7 +333,7 @@ def exp_kernel(w, out):  # type: ignore[no-untyped-def]
     out[2, 2] = 1.0 - b * (x * x + y * y)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def project_kernel(points, rotation, position, k, px, jacobian, depth):  # type: ignore[no-untyped-def]
     """Pixels (2K,), Jacobian (2K, 6) in the local increment, and depths (K,) of points (K, 3).
 

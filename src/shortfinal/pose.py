@@ -47,14 +47,14 @@ class SolverStatus(Enum):
     CONVERGED = "converged"  # one physical optimum, well determined
     AMBIGUOUS = "ambiguous"  # a second physical optimum explains the keypoints about as well
     ILL_CONDITIONED = "ill-conditioned"  # the points leave a direction free, or Σ is not positive definite
-    MAX_ITERATIONS = "max-iterations"  # no start reached a physical optimum in the iterations allowed
-    BEHIND_CAMERA = "behind-camera"  # points behind the camera, camera under the ground or upside down
+    BEHIND_CAMERA = "behind-camera"  # every optimum has a point behind, or the camera under ground or upside down
+    MAX_ITERATIONS = "max-iterations"  # no start reached an optimum in the iterations allowed
     NON_FINITE = "non-finite"  # NaN or infinity, in the input or (by overflow) in the arithmetic
 
 
 # The kernels' codes are the positions in the enum; of several failed starts the lowest is reported.
 STATUS_OF_CODE = tuple(SolverStatus)
-_CONVERGED, _AMBIGUOUS, _ILL_CONDITIONED, _MAX_ITERATIONS, _BEHIND_CAMERA, _NON_FINITE = range(len(STATUS_OF_CODE))
+_CONVERGED, _AMBIGUOUS, _ILL_CONDITIONED, _BEHIND_CAMERA, _MAX_ITERATIONS, _NON_FINITE = range(len(STATUS_OF_CODE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ class PoseEstimate:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimateBatch:
-    """N estimates as arrays; where `converged` and `AMBIGUOUS` both fail, a problem's numbers are NaN."""
+    """N estimates as arrays; the numbers of a problem neither CONVERGED nor AMBIGUOUS are NaN."""
 
     positions: Array  # (N, 3) m
     rotations: Array  # (N, 3, 3) runway_from_camera
@@ -149,9 +149,10 @@ def estimate_pose(
     _check_counts(len(keypoints.mean_px), len(world))
     result = _allocate(1, len(world))
     _solve_kernel(
-        keypoints.mean_px.reshape(1, -1),
-        keypoints.cov_px[None],
-        world[None],
+        # Copies: read-only arrays are another type to the compiler, and would be compiled for anew.
+        keypoints.mean_px.reshape(1, -1).copy(),
+        keypoints.cov_px[None].copy(),
+        world[None].copy(),
         camera.intrinsics,
         *_starts(initial),
         max_iterations,
@@ -175,7 +176,7 @@ def estimate_pose_batch(
     The numbers are not refused but answered: a NaN gives its problem NON_FINITE, a covariance that
     is not positive definite ILL_CONDITIONED. Raises InputError for shapes that do not match.
     """
-    mean, cov, world = (np.ascontiguousarray(a, dtype=np.float64) for a in (mean_px, cov_px, points))
+    mean, cov, world = (np.array(a, np.float64, order="C") for a in (mean_px, cov_px, points))
     cov, world = (a[None] if a.ndim == 2 else a for a in (cov, world))
     _check_shapes(mean, cov, world)
     count, k = mean.shape[:2]
@@ -284,7 +285,7 @@ def _starts(initial: Pose | None) -> tuple[Array, Array]:
     """Given starts as arrays: rotations (S, 3, 3) and positions (S, 3), S = 0 or 1."""
     if initial is None:
         return np.empty((0, 3, 3)), np.empty((0, 3))
-    return np.ascontiguousarray(initial.runway_from_camera)[None], initial.position_m[None]
+    return np.array([initial.runway_from_camera]), np.array([initial.position_m])
 
 
 def _estimate(result: _Result, i: int, keypoints: GaussianKeypoints, points: Array, camera: Camera) -> PoseEstimate:
@@ -307,7 +308,8 @@ def _estimate(result: _Result, i: int, keypoints: GaussianKeypoints, points: Arr
 # The kernels below are compiled. They work in memory the caller owns: nothing is allocated per
 # problem, and the interpreter's lock is released for the whole of a chunk.
 
-_SINGULAR = 1e-13  # scaled pivot: see _cholesky_kernel
+# Scaled pivot (see _cholesky_kernel). Points on a line leave 1e-15, a 300 m runway at 60 km 1e-6.
+_SINGULAR = 1e-12
 _STEP_TOLERANCE = 1e-12  # δᵀJᵀJδ: the last step is below a millionth of a standard deviation
 _FIRST_DAMPING = 1e-4
 # Attitude known to this (rad, 1σ) rules out an optimum that hangs upside down. Measured: of 80,000
@@ -315,7 +317,7 @@ _FIRST_DAMPING = 1e-4
 _SURE_TURN = 0.05
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _solve_kernel(mean, cov, points, intrinsics, rotations, positions, max_iterations, out):  # type: ignore[no-untyped-def]
     """N problems into `out`; `cov` and `points` have N rows or a single one, shared."""
     k, given = points.shape[1], rotations.shape[0]
@@ -341,12 +343,12 @@ def _solve_kernel(mean, cov, points, intrinsics, rotations, positions, max_itera
             _write_kernel(problem, best, system, i, out)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _state_kernel(k):  # type: ignore[no-untyped-def]
     return _State(np.empty((3, 3)), np.empty(3), np.empty(2 * k), np.empty((2 * k, 6)))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _planar_kernel(k):  # type: ignore[no-untyped-def]
     square = (3, 3)
     return _Planar(
@@ -355,7 +357,7 @@ def _planar_kernel(k):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _admit_kernel(problem):  # type: ignore[no-untyped-def]
     """Refuse NaN and infinity; replace the covariance by its Cholesky factor."""
     for array in (problem.mean, problem.points.ravel(), problem.whitener.ravel()):
@@ -365,7 +367,7 @@ def _admit_kernel(problem):  # type: ignore[no-untyped-def]
     return _CONVERGED if _cholesky_kernel(problem.whitener) > _SINGULAR else _ILL_CONDITIONED
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _search_kernel(problem, rotations, positions, best, current, trial, system, max_iterations):  # type: ignore[no-untyped-def]
     """Refine the starts; the status and the iterations, with the lowest physical optimum in `best`.
 
@@ -401,7 +403,7 @@ def _search_kernel(problem, rotations, positions, best, current, trial, system, 
     return status, iterations
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _turn_variance_kernel(factor):  # type: ignore[no-untyped-def]
     """Sum of the three variances of the rotation, rad².
 
@@ -413,7 +415,7 @@ def _turn_variance_kernel(factor):  # type: ignore[no-untyped-def]
     return 1.0 / a**2 + 1.0 / c**2 + 1.0 / f**2 + off
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _separation_kernel(normal, one, other):  # type: ignore[no-untyped-def]
     """Squared distance of two poses, each axis in the standard deviations it has by itself."""
     total = 0.0
@@ -424,7 +426,7 @@ def _separation_kernel(normal, one, other):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _write_kernel(problem, best, system, i, out):  # type: ignore[no-untyped-def]
     """The best optimum, with everything that belongs to it, into row `i`."""
     out.chi2[i] = _evaluate_kernel(problem, best)
@@ -440,7 +442,7 @@ def _write_kernel(problem, best, system, i, out):  # type: ignore[no-untyped-def
         _solve_factored_kernel(system.normal, out.covs[i, column])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _refine_kernel(problem, current, trial, system, max_iterations):  # type: ignore[no-untyped-def]
     """Levenberg-Marquardt from the current pose, in place: outcome, cost, iterations."""
     cost = _evaluate_kernel(problem, current)
@@ -466,7 +468,7 @@ def _refine_kernel(problem, current, trial, system, max_iterations):  # type: ig
     return _judge_kernel(current, system, outcome), cost, iteration
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _judge_kernel(current, system, outcome):  # type: ignore[no-untyped-def]
     """What the end of a refinement is worth: is it determined, and is it physical?"""
     system.factor[:] = system.normal
@@ -477,13 +479,13 @@ def _judge_kernel(current, system, outcome):  # type: ignore[no-untyped-def]
     return outcome
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _physical_kernel(rotation, position):  # type: ignore[no-untyped-def]
     """Above the ground and upright: the image's y axis points down."""
     return position[2] > 0.0 and rotation[2, 1] < 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _step_kernel(system, damping):  # type: ignore[no-untyped-def]
     """Solve (JᵀJ + damping diag JᵀJ) δ = Jᵀr (Marquardt 1963); returns δᵀJᵀJδ."""
     normal, factor, gradient, step = system.normal, system.factor, system.gradient, system.step
@@ -500,7 +502,7 @@ def _step_kernel(system, damping):  # type: ignore[no-untyped-def]
     return size
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _move_kernel(current, system, trial):  # type: ignore[no-untyped-def]
     """The pose moved by the step: p + δp, R exp(δθ)."""
     exp_kernel(system.step[3:], system.turn)
@@ -509,7 +511,7 @@ def _move_kernel(current, system, trial):  # type: ignore[no-untyped-def]
         trial.position[a] = current.position[a] + system.step[a]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate_kernel(problem, state):  # type: ignore[no-untyped-def]
     """Whitened residual and Jacobian at the pose; the cost, infinite with a point behind the camera."""
     project_kernel(
@@ -527,7 +529,7 @@ def _evaluate_kernel(problem, state):  # type: ignore[no-untyped-def]
     return _whiten_kernel(problem.whitener, problem.mean, state.residual, state.jacobian)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _whiten_kernel(whitener, mean, residual, jacobian):  # type: ignore[no-untyped-def]
     """L⁻¹ (mean - residual) and L⁻¹ jacobian in place, by forward substitution; the cost."""
     cost = 0.0
@@ -547,7 +549,7 @@ def _whiten_kernel(whitener, mean, residual, jacobian):  # type: ignore[no-untyp
     return cost if math.isfinite(cost) else math.nan
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _normal_kernel(jacobian, residual, normal, gradient):  # type: ignore[no-untyped-def]
     """JᵀJ and Jᵀr."""
     for a in range(normal.shape[0]):
@@ -563,7 +565,7 @@ def _normal_kernel(jacobian, residual, normal, gradient):  # type: ignore[no-unt
             normal[b, a] = total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cholesky_kernel(a):  # type: ignore[no-untyped-def]
     """Lower Cholesky factor in place; the smallest scaled pivot, or -1 where there is none.
 
@@ -589,7 +591,7 @@ def _cholesky_kernel(a):  # type: ignore[no-untyped-def]
     return smallest
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _solve_factored_kernel(factor, x):  # type: ignore[no-untyped-def]
     """Solve L Lᵀ x = b in place."""
     n = x.shape[0]
@@ -603,14 +605,14 @@ def _solve_factored_kernel(factor, x):  # type: ignore[no-untyped-def]
         x[i] /= factor[i, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _product_kernel(a, b, out):  # type: ignore[no-untyped-def]
     for i in range(3):
         for j in range(3):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _level_start_kernel(problem, state):  # type: ignore[no-untyped-def]
     """The last resort: level, on a 3° glide path, as far off as the points' width in view tells."""
     points, mean = problem.points, problem.mean
@@ -624,7 +626,7 @@ def _level_start_kernel(problem, state):  # type: ignore[no-untyped-def]
     state.position[2] = points[:, 2].mean() + distance * slope
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _planar_starts_kernel(problem, w, rotations, positions):  # type: ignore[no-untyped-def]
     """IPPE's two poses of the points' plane (Collins & Bartoli 2014) as starts; how many (0 or 2).
 
@@ -664,7 +666,7 @@ def _planar_starts_kernel(problem, w, rotations, positions):  # type: ignore[no-
     return 2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _ray_kernel(p, q, out):  # type: ignore[no-untyped-def]
     """The smallest turn that takes (0, 0, 1) to the direction of (p, q, 1), smooth at p = q = 0."""
     z = 1.0 / math.sqrt(1.0 + p * p + q * q)
@@ -674,7 +676,7 @@ def _ray_kernel(p, q, out):  # type: ignore[no-untyped-def]
     out[2, 0], out[2, 1], out[2, 2] = -x, -y, z
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _plane_kernel(points, w):  # type: ignore[no-untyped-def]
     """The plane z = a x + b y + c nearest the points: centre, axes, coordinates. False for a line."""
     centre, axes = w.centre, w.runway_from_plane
@@ -697,7 +699,7 @@ def _plane_kernel(points, w):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _basis_kernel(x0, x1, x2, y0, y1, y2, out):  # type: ignore[no-untyped-def]
     """A right-handed orthonormal basis as columns: the first along x, the second towards y."""
     n = 1.0 / math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
@@ -710,7 +712,7 @@ def _basis_kernel(x0, x1, x2, y0, y1, y2, out):  # type: ignore[no-untyped-def]
     out[0, 2], out[1, 2], out[2, 2] = z0, z1, z2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _flatten_kernel(problem, flat):  # type: ignore[no-untyped-def]
     """Undistorted image coordinates of the keypoints; False where the lens model has none."""
     for i in range(flat.shape[0]):
@@ -721,7 +723,7 @@ def _flatten_kernel(problem, flat):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _homography_kernel(flat, a, h):  # type: ignore[no-untyped-def]
     """Plane to image, by least squares: its value (p, q) and Jacobian (4 entries) at the centre.
 
@@ -752,7 +754,7 @@ def _homography_kernel(flat, a, h):  # type: ignore[no-untyped-def]
     return u0 + u * h[2], v0 + v * h[5], j00, j01, j10, j11
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _size_kernel(x):  # type: ignore[no-untyped-def]
     """Standard deviation, kept from zero."""
     mean, total = x.mean(), 0.0

@@ -31,7 +31,7 @@ class Runway:
     length_m: float
     width_m: float
     ident: str = ""  # airport and landing direction, e.g. "LFPO/24"
-    corners: Array | None = None  # type: ignore[assignment]
+    corners: Array = None  # type: ignore[assignment]  # set from the size if not given
 
     def __post_init__(self) -> None:
         for name in ("length_m", "width_m"):

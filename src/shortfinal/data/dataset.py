@@ -7,6 +7,7 @@ seed and its number alone, so an interrupted run continues where it stopped.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from shortfinal.crops import bogo_crop, box_around
 from shortfinal.data.scene import random_scene, random_sensor, render
 from shortfinal.errors import InputError
+from shortfinal.files import make_folder, write_png, write_whole
 from shortfinal.geometry import Camera, Pose, project
 from shortfinal.runway import Runway
 
@@ -43,18 +45,6 @@ class Example:
 
     image: Image  # (h, w, 3) RGB
     corners_px: Array  # (4, 2), keypoint order
-
-
-def replace_file(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all: to a temporary name beside it, then renamed."""
-    partial = path.with_name(path.name + ".tmp")
-    partial.write_bytes(content)
-    partial.replace(path)
-
-
-def encode_png(image: Image) -> bytes:
-    """PNG bytes of an RGB picture (h, w, 3)."""
-    return bytes(cv2.imencode(".png", image[..., ::-1])[1])
 
 
 def random_approach(rng: np.random.Generator, runway: Runway) -> Pose:
@@ -100,7 +90,11 @@ def render_example(seed: int, index: int) -> tuple[Example, dict[str, object]]:
 
 
 def write_dataset(
-    out: str | Path, count: int, seed: int = 0, workers: int | None = None, progress: Callable[[int], None] | None = None
+    out: str | Path,
+    count: int,
+    seed: int = 0,
+    workers: int | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> Path:
     """Render `count` examples into the folder `out`; pictures already there are kept.
 
@@ -111,8 +105,8 @@ def write_dataset(
     stamp = folder / "dataset.json"
     if stamp.exists() and json.loads(stamp.read_text())["seed"] != seed:
         raise InputError(f"{folder}: holds a data set of another seed; choose an empty folder or the same --seed")
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    stamp.write_text(json.dumps({"seed": seed}))
+    make_folder(folder / "images")
+    write_whole(stamp, json.dumps({"seed": seed}))
 
     def one(index: int) -> dict[str, object]:
         target = folder / f"images/{index:06d}.png"
@@ -122,8 +116,8 @@ def write_dataset(
         else:
             example, row = render_example(seed, index)
             row = {k: float(f"{v:.9g}") if isinstance(v, float) else v for k, v in row.items()}
-            replace_file(record, json.dumps(row).encode())
-            replace_file(target, encode_png(example.image))
+            write_whole(record, json.dumps(row))
+            write_png(target, example.image)
         if progress:
             progress(index)
         return row
@@ -131,12 +125,11 @@ def write_dataset(
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         rows = list(pool.map(one, range(count)))
     labels = folder / "labels.csv"
-    partial = labels.with_suffix(".tmp")
-    with partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
-    partial.replace(labels)
+    table = io.StringIO()
+    writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_whole(labels, table.getvalue())
     for record in (folder / "images").glob("*.json"):
         record.unlink()
     return labels
@@ -163,7 +156,9 @@ def read_dataset(folder: str | Path) -> RenderedDataset:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
     except OSError as error:
-        raise InputError(f"{path}: cannot read the labels: {error.strerror}; `shortfinal data render` writes them") from error
+        raise InputError(
+            f"{path}: cannot read the labels: {error.strerror}; `shortfinal data render` writes them"
+        ) from error
     if not rows:
         raise InputError(f"{path}: no rows")
     missing = [c for c in ("image", *_CORNER_COLUMNS) if c not in rows[0]]

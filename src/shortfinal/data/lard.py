@@ -19,6 +19,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,7 +153,7 @@ class _Row:
             self.refuse(column, f"expected {low:g} to {high:g}")
         return value
 
-    def refuse(self, column: str, mend: str) -> str:
+    def refuse(self, column: str, mend: str) -> NoReturn:
         raise InputError(f"{self.path}: line {self.line}: {column} is {self.get(column)!r}; {mend}")
 
 
@@ -211,8 +212,8 @@ def _corners(row: _Row, camera: Camera | None) -> tuple[Array, bool]:
 def _from_reading_order(px: Array) -> Array:
     """Corners A to D, read as text is read, into keypoint order: A and B are the far end's.
 
-    Roll swaps left and right in the reading order, and x alone can not undo it; the side of the
-    runway's axis can.
+    Roll decides which of a pair is read first; the side of the runway's axis it lies on tells left
+    from right at any roll.
     """
     far, near = px[:2], px[2:]
     axis = far.mean(axis=0) - near.mean(axis=0)

@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from shortfinal.errors import InputError
 from shortfinal.geometry import Camera, Pose, normalise_kernel
 from shortfinal.runway import Runway
 
@@ -93,10 +94,11 @@ def random_scene(rng: np.random.Generator, runway: Runway | None = None) -> Scen
     shoulder = np.clip(surface * u(0.7, 1.15) + rng.normal(0, 0.01, 3), 0.05, 0.9)
     grass = _ground_colour(rng)
     verge = np.clip(grass * u(0.6, 1.2) + rng.normal(0, 0.02, 3), 0.03, 0.9)
+    wet = rng.random() < 0.45
     horizon = np.array([u(0.62, 0.8), u(0.74, 0.86), u(0.86, 1.0)]) * u(0.8, 1.05)
     haze = np.clip(0.55 * horizon + 0.45 * np.array([0.35, 0.43, 0.6]) * u(0.7, 1.3), 0, 1)
     heading = u(0, math.pi)
-    wet = rng.random() < 0.45
+    hill = np.clip(haze * u(0.55, 0.95) + rng.normal(0, 0.02, 3), 0, 1)
     return Scene(
         length=length,
         width=width,
@@ -134,7 +136,7 @@ def random_scene(rng: np.random.Generator, runway: Runway | None = None) -> Scen
         relief=u(0.06, 0.4),
         horizon=horizon,
         zenith=horizon * np.array([u(0.3, 0.7), u(0.55, 0.85), u(0.8, 1.05)]) if rng.random() < 0.8 else horizon * 0.9,
-        hills=np.array([u(0, 0.02) * (rng.random() < 0.7), u(0.03, 0.3), *np.clip(haze * u(0.55, 0.95) + rng.normal(0, 0.02, 3), 0, 1)]),
+        hills=np.array([u(0, 0.02) * (rng.random() < 0.7), u(0.03, 0.3), *hill]),
         haze=np.array([float(np.exp(u(np.log(5000), np.log(60000)))), *haze]),
         sun=np.array([float(np.exp(u(np.log(0.5), np.log(1.3)))), *(1 + rng.normal(0, 0.035, 3))]),
     )  # fmt: skip
@@ -156,9 +158,7 @@ def render(
     touches the airfield. `seed` fixes the sensor's noise.
     """
     if pose.position_m[2] <= 0:
-        from shortfinal.errors import InputError
-
-        raise InputError(f"pose: the camera is {pose.position_m[2]:.1f} m above the runway; it must be above the ground")
+        raise InputError(f"pose: the camera is at a height of {pose.position_m[2]:.1f} m; it must be above the runway")
     out = np.empty((camera.height, camera.width, 3), np.float32)
     rotation = np.ascontiguousarray(pose.runway_from_camera)
     _render_kernel(_packed(scene), camera.intrinsics, rotation, pose.position_m, _noise_table(), samples, out)
@@ -174,8 +174,9 @@ def expose(light: NDArray[np.float32], sensor: Sensor, rng: np.random.Generator)
     picture = np.clip(light + 0.5, 0, 255).astype(np.uint8)
     if sensor.jpeg_quality:
         _, code = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, sensor.jpeg_quality])
-        picture = np.ascontiguousarray(cv2.imdecode(code, cv2.IMREAD_COLOR)[..., ::-1])  # type: ignore[index]
-    return picture
+        decoded = np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR), np.uint8)
+        picture = np.ascontiguousarray(decoded[..., ::-1])
+    return np.asarray(picture, np.uint8)
 
 
 def _ground_colour(rng: np.random.Generator) -> Array:
@@ -183,7 +184,8 @@ def _ground_colour(rng: np.random.Generator) -> Array:
         [0.25, 0.34, 0.16], [0.36, 0.40, 0.24], [0.46, 0.40, 0.28], [0.33, 0.28, 0.22],
         [0.17, 0.24, 0.13], [0.55, 0.49, 0.36], [0.42, 0.36, 0.31], [0.30, 0.32, 0.30],
     ])  # fmt: skip
-    return np.clip(kinds[rng.integers(len(kinds))] * rng.uniform(0.7, 1.35) + rng.normal(0, 0.03, 3), 0.02, 0.9)
+    colour = kinds[rng.integers(len(kinds))] * rng.uniform(0.7, 1.35) + rng.normal(0, 0.03, 3)
+    return np.asarray(np.clip(colour, 0.02, 0.9))
 
 
 def _pad(rng: np.random.Generator, surface: Array) -> Array:
@@ -218,7 +220,8 @@ def _strips(rng: np.random.Generator, length: float, width: float, surface: Arra
         angle = rng.normal(0, 0.02) if rng.random() < 0.5 else rng.uniform(0.3, 2.8)
         centre = np.array([rng.uniform(0, length), side * rng.uniform(2.5 * width, 900)])
         arm = rng.uniform(500, 1600) * np.array([math.cos(angle), math.sin(angle)])
-        add(*(centre - arm), *(centre + arm), rng.uniform(10, 30))
+        (x0, y0), (x1, y1) = centre - arm, centre + arm
+        add(x0, y0, x1, y1, rng.uniform(10, 30))
     if rng.random() < 0.5:  # apron
         x, y = rng.uniform(0, length), side * rng.uniform(150, 500)
         add(x, y, x + rng.uniform(100, 600), y, rng.uniform(40, 100))
@@ -240,7 +243,7 @@ def _digits(*numbers: int) -> NDArray[np.float32]:
         mask = np.zeros((40, 64), np.uint8)
         cv2.putText(mask, f"{number:02d}", (8, 37), cv2.FONT_HERSHEY_SIMPLEX, 1.25, 255, 5, cv2.LINE_AA)
         masks.append(mask)
-    return np.asarray(np.stack(masks), np.float32) / 255
+    return np.stack(masks).astype(np.float32) / np.float32(255)
 
 
 def _packed(scene: Scene) -> NDArray[np.void]:
@@ -447,7 +450,9 @@ def _cover(s: Any, table: Any, x: Any, y: Any, footprint: Any, rgb: Any) -> None
         sharp = min(1.0, s.town[2] / (1.2 * footprint))
         for c in range(3):
             roof = _hash(i, j, s.seed + 5)  # half of the blocks are gardens
-            block = 0.3 + 1.0 * (roof - 0.5) + 0.08 * _hash(i, j, s.seed + 6 + c) if roof > 0.5 else s.forest[2 + c] + 0.1
+            block = (
+                0.3 + 1.0 * (roof - 0.5) + 0.08 * _hash(i, j, s.seed + 6 + c) if roof > 0.5 else s.forest[2 + c] + 0.1
+            )
             rgb[c] += min(1.0, 12.0 * built) * (sharp * block + (1 - sharp) * 0.38 - rgb[c])
     ahead = max(0.0, max(-x, x - s.length) - s.airfield[1])
     beside = max(0.0, abs(y) - s.airfield[0])
@@ -490,7 +495,9 @@ def _sky(s: Any, table: Any, azimuth: Any, elevation: Any, rgb: Any) -> None:
 
 
 @_kernel
-def _render_kernel(packed: Any, intrinsics: Any, rotation: Any, position: Any, table: Any, samples: Any, out: Any) -> None:
+def _render_kernel(
+    packed: Any, intrinsics: Any, rotation: Any, position: Any, table: Any, samples: Any, out: Any
+) -> None:
     s = packed[0]
     height, width = out.shape[0], out.shape[1]
     base, rgb, total, haze = np.empty(3), np.empty(3), np.empty(3), s.haze
@@ -516,7 +523,8 @@ def _render_kernel(packed: Any, intrinsics: Any, rotation: Any, position: Any, t
                 )
                 count = samples if near_airfield else max(1, min(2, samples))
                 grain = s.roughness * 2.0 * (
-                    _fractal(table, 0.15 * x, y, 24.0, 6, 0.4 * footprint) + 0.5 * _noise(table, 0.004 * x, 0.2 * y) - 0.25
+                    _fractal(table, 0.15 * x, y, 24.0, 6, 0.4 * footprint)
+                    + 0.5 * _noise(table, 0.004 * x, 0.2 * y) - 0.25
                 )  # fmt: skip
                 # The smooth cover is added once, as what it changes at the pixel's centre.
                 _shade_land(s, table, x, y, footprint, base)

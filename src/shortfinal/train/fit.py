@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from shortfinal.crops import bogo_crop, box_around, centre_crop
 from shortfinal.data.dataset import Example, read_dataset
 from shortfinal.detector import crop_image, normalise
 from shortfinal.errors import InputError
+from shortfinal.files import make_folder, write_whole
 from shortfinal.geometry import PixelWindow
 from shortfinal.train.model import KeypointNet, gaussian_nll, to_pixels, variance_px
 
@@ -74,7 +76,9 @@ def augment(crop: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uin
     return crop
 
 
-def training_crop(example: Example, size: int, rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def training_crop(
+    example: Example, size: int, rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """A random crop (size, size, 3) of an example, and its corners (4, 2); half of them mirrored."""
     height, width = example.image.shape[:2]
     box = box_around(example.corners_px)
@@ -155,7 +159,8 @@ class Run:
     def __init__(self, recipe: Recipe) -> None:
         self.recipe, self.folder = recipe, Path(recipe.out)
         torch.manual_seed(recipe.seed)
-        self.model: torch.nn.Module = KeypointNet(recipe.backbone, width=recipe.width).to(memory_format=torch.channels_last)
+        self.model = KeypointNet(recipe.backbone, width=recipe.width)
+        self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema), use_buffers=True)
         self.optimizer = torch.optim.AdamW(
             self.model.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay
@@ -169,9 +174,9 @@ class Run:
         """Write a checkpoint whole or not at all."""
         parts = {p: getattr(self, p).state_dict() for p in ("model", "average", "optimizer", "schedule")}
         state = parts | {"step": self.step, "best": self.best, "recipe": asdict(self.recipe)}
-        partial = self.folder / f"{name}.tmp"
-        torch.save(state, partial)
-        partial.replace(self.folder / name)
+        content = io.BytesIO()
+        torch.save(state, content)
+        write_whole(self.folder / name, content.getvalue())
 
     def resume(self) -> bool:
         """Go on from last.pt, if there is one. Raises InputError if it was made by another recipe."""
@@ -227,8 +232,7 @@ def train(recipe: Recipe, console: Console | None = None) -> dict[str, float]:
     Keeps out/last.pt for resuming and out/log.csv, a row at each validation.
     """
     console = console or Console()
-    folder = Path(recipe.out)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(recipe.out)
     run = Run(recipe)
     if run.resume():
         console.print(f"going on from step {run.step}")
@@ -249,16 +253,26 @@ def train(recipe: Recipe, console: Console | None = None) -> dict[str, float]:
                 if figures["nll"] < run.best:
                     run.best = figures["nll"]
                     run.save("best.pt")
-                    partial = folder / "best.tmp"
-                    partial.write_text(json.dumps(figures, indent=1))
-                    partial.replace(folder / "best.json")
+                    write_whole(folder / "best.json", json.dumps(figures, indent=1))
                 run.save("last.pt")
     best: dict[str, float] = json.loads((folder / "best.json").read_text())
     return best
 
 
+def validation_figures(checkpoint: str | Path) -> dict[str, float]:
+    """What `train` measured on the held-out scenes when it wrote the best checkpoint; {} for another."""
+    record = Path(checkpoint).with_suffix(".json")
+    figures: dict[str, float] = json.loads(record.read_text()) if record.exists() else {}
+    return figures
+
+
 def _bar(console: Console) -> Progress:
-    columns = (BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"))
+    columns = (
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total}"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
     return Progress(*columns, console=console)
 
 

@@ -33,10 +33,12 @@ class KeypointNet(nn.Module):
         pretrained: bool = False,
     ) -> None:
         super().__init__()
-        every = timm.create_model(backbone, features_only=True, pretrained=False).feature_info.reduction()
+        probe: Any = timm.create_model(backbone, features_only=True, pretrained=False)
+        every = probe.feature_info.reduction()
         taken = [len(every) - 1 - every[::-1].index(stride) for stride in strides]
-        self.backbone: Any = timm.create_model(backbone, features_only=True, pretrained=pretrained, out_indices=taken)
-        channels = self.backbone.feature_info.channels()
+        features: Any = timm.create_model(backbone, features_only=True, pretrained=pretrained, out_indices=taken)
+        self.backbone = features
+        channels: list[int] = features.feature_info.channels()
         self.lateral = nn.ModuleList([nn.Conv2d(c, width, 1, bias=False) for c in channels])
         self.fuse = nn.Sequential(
             nn.BatchNorm2d(width), nn.Hardswish(),
@@ -47,6 +49,7 @@ class KeypointNet(nn.Module):
         self.log_variance = nn.ModuleList([nn.Linear(2 * width + 2, 2) for _ in range(keypoints)])
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Means in [0, 1] and log-variances in px²."""
         maps = self.backbone(image)
         size = maps[0].shape[-2:]
         fused = self.lateral[0](maps[0])
@@ -60,7 +63,7 @@ class KeypointNet(nn.Module):
     def _variances(self, fused: Tensor, attention: Tensor, spread: Tensor) -> Tensor:
         """Pool, linear (the exponential follows in the loss): pooled over the image and, for each
         keypoint, where its attention lies, with the attention's own spread.
-        """  # noqa: D205
+        """
         local = attention @ fused.transpose(1, 2)  # (B, K, C)
         everywhere = fused.mean(dim=-1, keepdim=True).transpose(1, 2).expand_as(local)
         pooled = torch.cat([local, everywhere, spread.clamp_min(1e-6).log()], dim=-1)

@@ -1,0 +1,384 @@
+"""The command line: parse, call, print. Exit status 0 done, 1 the job failed, 2 the input was wrong."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import typer
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from shortfinal.errors import InputError, JobError
+
+if TYPE_CHECKING:
+    from shortfinal.demo import Flown
+    from shortfinal.evaluate import Evaluation
+    from shortfinal.pipeline import FrameResult
+
+T = TypeVar("T")
+
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None,
+    help="Runway keypoints with uncertainty, the pose they give, and whether to believe it.",
+)  # fmt: skip
+data_app = typer.Typer(no_args_is_help=True, help="Data sets.")
+app.add_typer(data_app, name="data")
+
+console = Console()
+_STYLES = {"use": "green", "do-not-use": "bold red", "not-monitored": "yellow"}
+
+Out = Annotated[Path, typer.Option(help="Folder for the results; made if it does not exist.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
+Model = Annotated[Path | None, typer.Option(help="Model file (ONNX); the one that ships by default.")]
+Rate = Annotated[float, typer.Option(help="Share of faultless frames that may be refused.")]
+CameraFile = Annotated[Path | None, typer.Option(help="Camera (TOML): width, height, fx, fy, cx, cy, distortion.")]
+Runways = Annotated[Path | None, typer.Option(help="Runway database (LARD's JSON), or set SHORTFINAL_RUNWAYS.")]
+
+
+def main() -> None:
+    """Entry point: wrong input is one line on standard error and exit status 2."""
+    try:
+        app()
+    except InputError as error:
+        print(f"shortfinal: {error}", file=sys.stderr)  # noqa: T201
+        sys.exit(2)
+    except JobError as error:
+        print(f"shortfinal: {error}", file=sys.stderr)  # noqa: T201
+        sys.exit(1)
+
+
+@app.command()
+def demo(out: Out = Path("results/demo"), model: Model = None, as_json: Json = False) -> None:
+    """The main job on an embedded approach: watch the verdict, and what two faults do to it."""
+    from shortfinal.demo import FRAMES, run_demo
+
+    if as_json:
+        flown = run_demo(out, model=model)
+        _print_json(_demo_summary(flown) | {"out": str(out)})
+        return
+    rows: list[Flown] = []
+    with Live(console=console, refresh_per_second=4, vertical_overflow="crop") as live:
+
+        def seen(frame: Flown) -> None:
+            rows.append(frame)
+            progress = f"frame {len(rows)} of {FRAMES}"
+            live.update(Group(_demo_table(rows[-14:]), Text(progress, style="dim")))
+
+        flown = run_demo(out, seen, model)
+        live.update(_demo_table([f for f in flown if f.number % 7 == 3]))
+    _print_demo_summary(flown, out)
+
+
+@app.command()
+def run(
+    source: Annotated[Path, typer.Argument(help="Folder of images.")],
+    labels: Annotated[Path | None, typer.Option(help="LARD labels, or boxes: image, left, top, right, bottom. "
+                                                     "SOURCE/labels.csv by default.")] = None,
+    camera: CameraFile = None,
+    runway: Annotated[str, typer.Option(help="Landing direction, e.g. LFPO/24, where the labels do not say.")] = "",
+    runways: Runways = None,
+    size: Annotated[str, typer.Option(help="Runway length x width, m, e.g. 2000x45, instead of a database.")] = "",
+    out: Out = Path("results/run"),
+    model: Model = None,
+    false_alarm_rate: Rate = 1e-3,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    """Keypoints, pose and verdict for every labelled image of a folder."""
+    from shortfinal.runway import find_runway
+    from shortfinal.stream.source import LabelledFolder, read_camera
+
+    given = _sized_runway(size, runway) if size else find_runway(runway, runways) if runway else None
+    folder = LabelledFolder(
+        source, labels or source / "labels.csv", camera=read_camera(camera) if camera else None,
+        runway=given, database=runways,
+    )  # fmt: skip
+    evaluation, results = _run_folder(folder, out, model, false_alarm_rate, quiet=as_json)
+    if as_json:
+        _print_json(asdict(evaluation) | {"out": str(out)})
+        return
+    _print_evaluation(evaluation)
+    _print_refused(results)
+    console.print(f"written: {out}/frames.jsonl, evaluation.json, contact_sheet.png")
+
+
+@app.command()
+def audit(
+    labels: Annotated[Path, typer.Argument(help="LARD label file (v1 or v2).")],
+    runways: Annotated[Path, typer.Option(help="Runway database (LARD's JSON).")],
+    out: Out = Path("results/audit"),
+    sigma_px: Annotated[float | None, typer.Option(help="Of a label; what rounding gives by default.")] = None,
+    false_alarm_rate: Rate = 1e-3,
+    camera: CameraFile = None,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    """Which labels contradict their runway? RAIM over a label file, worst first."""
+    from shortfinal.audit import audit_file, render_summary, report_as_dict
+    from shortfinal.stream.source import read_camera
+
+    given = read_camera(camera) if camera else None
+    report = audit_file(labels, runways, out, sigma_px=sigma_px, false_alarm_rate=false_alarm_rate, camera=given)
+    if as_json:
+        _print_json(report_as_dict(report))
+        return
+    console.print(render_summary(report))
+    console.print(f"written: {out}/audit.csv, audit.json, audit.png")
+
+
+@app.command()
+def solve(
+    problem: Annotated[Path, typer.Argument(help="JSON: camera, keypoints_px, sigma_px or cov_px, runway.")],
+    false_alarm_rate: Rate = 1e-3,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    """Pose and verdict from keypoints that someone else found."""
+    from shortfinal.integrity import check_integrity
+    from shortfinal.problem import read_problem
+
+    estimate = read_problem(problem).solve()
+    verdict = check_integrity(estimate, false_alarm_rate)
+    if estimate.pose is None or estimate.cov is None:
+        raise InputError(f"{problem}: no pose: {verdict.reasons[0]}")
+    record = {
+        "status": estimate.status.value, "position_m": estimate.pose.position_m.tolist(),
+        "attitude_deg": list(estimate.pose.attitude), "cov": estimate.cov.tolist(),
+        "decision": verdict.decision.value, "reasons": list(verdict.reasons),
+        "statistic": verdict.statistic, "dof": verdict.dof, "p_value": verdict.p_value,
+    }  # fmt: skip
+    if as_json:
+        _print_json(record)
+        return
+    sigma = estimate.sigma_position_m
+    assert sigma is not None
+    for name, value, s in zip("xyz", estimate.pose.position_m, sigma, strict=True):
+        console.print(f"{name}  {value:12.3f} ± {2 * s:.3f} m (2σ)")
+    console.print("yaw {:.3f}, pitch {:.3f}, roll {:.3f} degrees".format(*estimate.pose.attitude))
+    console.print(f"{verdict.decision.value}: {'; '.join(verdict.reasons)}", style=_STYLES[verdict.decision.value])
+
+
+@app.command()
+def train(
+    data: Annotated[Path, typer.Option(help="Training scenes, from `shortfinal data render`.")],
+    validation: Annotated[Path, typer.Option(help="Held-out scenes, rendered with another seed.")],
+    out: Out = Path("runs/latest"),
+    backbone: Annotated[str, typer.Option(help="Any timm model.")] = "mobilenetv3_small_100",
+    steps: Annotated[int, typer.Option(help="Batches to train on.", min=1)] = 10000,
+    batch: Annotated[int, typer.Option(min=2)] = 32,
+    learning_rate: Annotated[float, typer.Option(min=0)] = 2e-3,
+    validate_every: Annotated[int, typer.Option(help="Steps between validations and checkpoints.", min=1)] = 500,
+    workers: Annotated[int, typer.Option(help="Processes that prepare crops.", min=0)] = 1,
+    seed: int = 0,
+) -> None:  # fmt: skip
+    """Train a network on rendered scenes; run again with the same --out to go on after a stop."""
+    from shortfinal.train.fit import Recipe
+    from shortfinal.train.fit import train as fit
+
+    recipe = Recipe(
+        str(data), str(validation), str(out), backbone=backbone, steps=steps, batch=batch, learning_rate=learning_rate,
+        validate_every=validate_every, workers=workers, seed=seed,
+    )  # fmt: skip
+    figures = fit(recipe, console)
+    console.print(f"best checkpoint: {out}/best.pt, " + ", ".join(f"{k} {v:.3f}" for k, v in figures.items()))
+
+
+@app.command()
+def export(
+    checkpoint: Annotated[Path, typer.Argument(help="best.pt of a training run.")],
+    out: Annotated[Path, typer.Argument(help="Model file to write (.onnx).")],
+) -> None:
+    """Write a checkpoint as a model file that describes itself, checked against torch."""
+    from shortfinal.train.export import export as write
+
+    info = write(checkpoint, out)
+    console.print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB, {info.backbone}, {info.covariance} covariance)")
+
+
+@data_app.command("render")
+def data_render(
+    count: Annotated[int, typer.Option(help="How many pictures.", min=1)],
+    out: Annotated[Path, typer.Option(help="Folder of the data set.")],
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Threads; all cores by default.")] = None,
+) -> None:
+    """Render a data set of random approaches with exact labels; run again to go on after a stop."""
+    from shortfinal.data.dataset import write_dataset
+
+    with _bar() as bar:
+        task = bar.add_task("rendering", total=count)
+        labels = write_dataset(out, count, seed, workers, lambda _: bar.advance(task))
+    console.print(f"written: {labels}")
+
+
+def _run_folder(
+    folder: Any, out: Path, model: Path | None, false_alarm_rate: float, *, quiet: bool
+) -> tuple[Evaluation, list[tuple[str, FrameResult]]]:
+    from shortfinal.detector import KeypointDetector
+    from shortfinal.evaluate import evaluate
+    from shortfinal.files import make_folder, write_png, write_whole
+    from shortfinal.pipeline import LandingPipeline
+    from shortfinal.stream.overlay import Notes, contact_sheet, draw_result
+    from shortfinal.stream.sink import JsonlWriter
+
+    detector, target = KeypointDetector(model), make_folder(out)
+    results, truths, distances, pictures = [], [], [], []
+    every = max(1, len(folder) // 24)
+    with JsonlWriter(target / "frames.jsonl") as lines:
+        for number, frame in enumerate(_track(folder, len(folder), quiet)):
+            pipeline = LandingPipeline(detector, frame.runway, frame.camera, false_alarm_rate=false_alarm_rate)
+            result = pipeline.step(frame.image, box=frame.box)
+            truth = None if frame.truth_px is None else frame.truth_px.tolist()
+            lines.write(
+                {"image": frame.name, **result.to_dict(), "truth_px": truth, "recorded_distance_m": frame.distance_m}
+            )
+            results.append((frame.name, result))
+            truths.append(frame.truth_px)
+            distances.append(frame.distance_m)
+            if number % every == 0:
+                pictures.append(draw_result(frame.image, result, Notes(f"{frame.name}  {frame.runway.ident}")))
+    evaluation = evaluate([r for _, r in results], truths, distances)
+    write_png(target / "contact_sheet.png", contact_sheet(pictures, columns=4, width=560))
+    write_whole(target / "evaluation.json", json.dumps(asdict(evaluation), indent=1))
+    return evaluation, results
+
+
+def _sized_runway(size: str, ident: str) -> Any:
+    from shortfinal.runway import Runway
+
+    length, _, width = size.lower().partition("x")
+    try:
+        return Runway(float(length), float(width), ident)
+    except ValueError as error:
+        raise InputError(f"--size: {size!r}; expected length x width in metres, e.g. 2000x45") from error
+
+
+def _bar() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
+    )
+
+
+def _track(items: Iterable[T], total: int, quiet: bool) -> Iterator[T]:
+    if quiet:
+        yield from items
+        return
+    with _bar() as bar:
+        yield from bar.track(items, total=total, description="frames")
+
+
+def _print_json(record: dict[str, Any]) -> None:
+    print(json.dumps(record))  # noqa: T201
+
+
+def _table(title: str, columns: tuple[str, ...]) -> Table:
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for name in columns:
+        table.add_column(
+            name, justify="right" if name not in ("fault", "verdict", "why", "corners", "image") else "left"
+        )
+    return table
+
+
+def _demo_table(frames: Iterable[Flown]) -> Table:
+    table = _table(
+        "", ("frame", "distance", "height", "left", "err along", "err height", "σ px", "p", "verdict", "fault")
+    )
+    for f in frames:
+        estimate, keypoints = f.result.estimate, f.result.keypoints
+        cells = ["–"] * 5
+        if estimate is not None and estimate.pose is not None and estimate.cov is not None and f.error_m is not None:
+            x, y, z = estimate.pose.position_m
+            sx, sy, sz = 2 * estimate.cov.diagonal()[:3] ** 0.5
+            cells = [f"{-x:.0f} ± {sx:.0f}", f"{z:.1f} ± {sz:.1f}", f"{y:.1f} ± {sy:.1f}",
+                     f"{f.error_m[0]:+.1f}", f"{f.error_m[2]:+.1f}"]  # fmt: skip
+        sigma = "–" if keypoints is None else f"{keypoints.sigma_px.mean():.2f}"
+        p, decision = f.result.verdict.p_value, f.result.verdict.decision.value
+        style = _STYLES[decision]
+        table.add_row(str(f.number), *cells, sigma, "–" if p is None else f"{p:.1e}", Text(decision, style=style),
+                      Text(f.fault.value.removeprefix("injected: "), style="yellow"))  # fmt: skip
+    return table
+
+
+def _demo_summary(flown: list[Flown]) -> dict[str, Any]:
+    from shortfinal.demo import Fault
+    from shortfinal.integrity import Decision
+
+    summary: dict[str, Any] = {}
+    for fault in Fault:
+        mine = [f for f in flown if f.fault is fault]
+        used = [f.error_m for f in mine if f.result.verdict.decision is Decision.USE and f.error_m is not None]
+        summary[fault.name.lower()] = {
+            "frames": len(mine),
+            **{d.value: sum(f.result.verdict.decision is d for f in mine) for d in Decision},
+            "median_used_error_m": _medians(used),
+        }
+    return summary
+
+
+def _medians(errors: list[Any]) -> dict[str, float] | None:
+    from statistics import median
+
+    names = ("along", "cross", "vertical")
+    return {n: round(median(abs(float(e[i])) for e in errors), 2) for i, n in enumerate(names)} if errors else None
+
+
+def _print_demo_summary(flown: list[Flown], out: Path) -> None:
+    titles = {
+        "none": "no fault",
+        "far_threshold": "far threshold 184 m short",
+        "near_corner": "near corner on a taxiway",
+    }
+    table = _table("", ("fault", "frames", "used", "refused", "not monitored", "error of used frames: along", "height"))
+    for name, row in _demo_summary(flown).items():
+        error = row["median_used_error_m"]
+        cells = ("–", "–") if error is None else (f"{error['along']:.1f} m", f"{error['vertical']:.1f} m")
+        counts = (str(row[k]) for k in ("frames", "use", "do-not-use", "not-monitored"))
+        table.add_row(titles[name], *counts, *cells)
+    console.print(table)
+    console.print(
+        "Refused is right for the corner on the taxiway. The misplaced far threshold fits another pose so well that\n"
+        "a single frame often cannot show it: look at the error that then goes unnoticed (docs/integrity.md)."
+    )
+    console.print(f"written: {out}/approach.mp4, contact_sheet.png, timeline.png, frames.jsonl")
+
+
+def _print_evaluation(evaluation: Evaluation) -> None:
+    from shortfinal.evaluate import rows
+
+    decisions = ", ".join(f"{count} {name}" for name, count in evaluation.decisions.items())
+    console.print(f"{evaluation.frames} frames: {decisions}")
+    if evaluation.all is None:
+        return
+    table = _table("", ("corners", "median px", "90 % px", "mean px", "median σ px", "in 68 %", "in 95 %"))
+    for name, f in rows(evaluation):
+        numbers = (f"{v:.2f}" for v in (f.median_px, f.p90_px, f.mean_px, f.sigma_median_px))
+        table.add_row(name, *numbers, f"{f.coverage_68:.0%}", f"{f.coverage_95:.0%}")
+    console.print(table)
+    if evaluation.distance_error:
+        e = evaluation.distance_error
+        console.print(
+            f"distance error: median {e['median']:.1%}, 90 % {e['p90']:.1%} of {e['frames']:.0f} solved frames"
+        )
+
+
+def _print_refused(results: list[tuple[str, FrameResult]], most: int = 10) -> None:
+    refused = [(name, r) for name, r in results if r.verdict.decision.value != "use"]
+    if not refused:
+        return
+    table = _table(
+        f"{len(refused)} frames not to be used, the first {min(most, len(refused))}", ("image", "verdict", "why")
+    )
+    for name, result in refused[:most]:
+        decision = result.verdict.decision.value
+        table.add_row(Text(name), Text(decision, style=_STYLES[decision]), Text("; ".join(result.verdict.reasons)))
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""Files written whole or not at all: beside their name first, then renamed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shortfinal.errors import InputError
+
+
+def partial_of(path: Path) -> Path:
+    """The temporary name of a file; it keeps the suffix, from which writers tell the format."""
+    return path.with_name(f"{path.stem}.partial{path.suffix}")
+
+
+def write_whole(path: str | Path, content: bytes | str) -> None:
+    """Write a file; text as UTF-8. An interrupted call leaves what was there before.
+
+    Raises InputError if the file cannot be written there.
+    """
+    target = Path(path)
+    partial = partial_of(target)
+    try:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        partial.replace(target)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written: {error.strerror}") from error
+
+
+def write_png(path: str | Path, picture: NDArray[np.uint8]) -> None:
+    """An RGB picture (h, w, 3) as PNG."""
+    import cv2
+
+    write_whole(path, bytes(cv2.imencode(".png", picture[..., ::-1])[1]))
+
+
+def make_folder(path: str | Path) -> Path:
+    """The folder, made if need be. Raises InputError if it cannot be."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot make the output folder: {error.strerror}") from error
+    return folder

@@ -1,0 +1,78 @@
+"""A pose problem in a JSON file: keypoints that someone else found, for `shortfinal solve`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shortfinal.errors import InputError
+from shortfinal.geometry import Camera
+from shortfinal.keypoints import GaussianKeypoints
+from shortfinal.pose import PoseEstimate, estimate_pose
+from shortfinal.runway import Runway
+
+
+@dataclass(frozen=True, eq=False)
+class PoseProblem:
+    """What `estimate_pose` needs."""
+
+    keypoints: GaussianKeypoints
+    points_m: NDArray[np.float64]  # (K, 3) runway frame
+    camera: Camera
+
+    def solve(self) -> PoseEstimate:
+        """The estimate, whatever its status."""
+        return estimate_pose(self.keypoints, self.points_m, self.camera)
+
+
+def read_problem(path: str | Path) -> PoseProblem:
+    """Read a problem.
+
+    {"camera": {"width", "height", "fx", "fy", "cx", "cy", "distortion"}, "keypoints_px": K x 2,
+    "sigma_px": one number or K x 2, or "cov_px": 2K x 2K, "points_m": K x 3, or "runway":
+    {"length_m", "width_m"}}. Raises InputError naming the file and the field.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the problem: {error.strerror}") from error
+    except ValueError as error:
+        raise InputError(f"{path}: not a JSON file: {error}") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected a JSON object with camera, keypoints_px, sigma_px and runway")
+    try:
+        return _problem(content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _problem(content: dict[str, Any]) -> PoseProblem:
+    camera = _build(Camera, _field(content, "camera"), "camera")
+    if "points_m" in content:
+        points = np.asarray(content["points_m"])
+    else:
+        points = _build(Runway, _field(content, "runway"), "runway").corners
+    mean = _field(content, "keypoints_px")
+    if "cov_px" in content:
+        keypoints = GaussianKeypoints(mean, content["cov_px"])
+    else:
+        keypoints = GaussianKeypoints.from_sigma(mean, _field(content, "sigma_px"))
+    return PoseProblem(keypoints, points, camera)
+
+
+def _field(content: dict[str, Any], name: str) -> Any:
+    if name not in content:
+        raise InputError(f"no field {name!r}; it has {', '.join(content) or 'none'}")
+    return content[name]
+
+
+def _build(kind: Any, values: Any, name: str) -> Any:
+    try:
+        return kind(**values)
+    except TypeError as error:
+        raise InputError(f"{name}: {error}") from error

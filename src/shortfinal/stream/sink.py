@@ -1,0 +1,75 @@
+"""Results on disk. Every file is written beside its name and renamed when whole."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shortfinal.files import partial_of
+
+Image = NDArray[np.uint8]
+
+
+class _Partial:
+    """A file that appears under its name only when the block ends without an error."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.partial = partial_of(self.path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
+        self.close()
+        if kind is None and self.partial.exists():
+            self.partial.replace(self.path)
+        else:
+            self.partial.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Flush what was written."""
+
+
+class JsonlWriter(_Partial):
+    """One JSON object a line."""
+
+    def __init__(self, path: str | Path) -> None:
+        super().__init__(path)
+        self._file = self.partial.open("w", encoding="utf-8")
+
+    def write(self, record: dict[str, Any]) -> None:
+        """Append one record. NaN and infinity are no JSON, and an error."""
+        self._file.write(json.dumps(record, allow_nan=False) + "\n")
+
+    def close(self) -> None:
+        """Flush the lines."""
+        self._file.close()
+
+
+class VideoWriter(_Partial):
+    """An MP4 of RGB pictures of one size, which must be even."""
+
+    def __init__(self, path: str | Path, fps: float) -> None:
+        super().__init__(path)
+        self._fps, self._writer = fps, cv2.VideoWriter()
+
+    def write(self, picture: Image) -> None:
+        """Append one picture (h, w, 3) RGB."""
+        if not self._writer.isOpened():
+            size = (picture.shape[1], picture.shape[0])
+            for codec in ("avc1", "mp4v"):  # H.264, where this build of OpenCV has it, plays in browsers
+                fourcc = cv2.VideoWriter.fourcc(*codec)
+                if self._writer.open(str(self.partial), cv2.CAP_FFMPEG, fourcc, self._fps, size):
+                    break
+        self._writer.write(np.ascontiguousarray(picture[..., ::-1]))
+
+    def close(self) -> None:
+        """Write the index."""
+        self._writer.release()
