@@ -31,7 +31,8 @@ def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> Arra
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected numbers, got {value!r:.80}") from error
+        given = " ".join(repr(value).split())
+        raise InputError(f"{name}: expected numbers, got {given:.80}") from error
     matches = array.ndim == len(shape) and all(
         want in (None, got) for want, got in zip(shape, array.shape, strict=True)
     )

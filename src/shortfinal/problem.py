@@ -19,15 +19,19 @@ from shortfinal.runway import Runway
 
 @dataclass(frozen=True, eq=False)
 class PoseProblem:
-    """What `estimate_pose` needs."""
+    """What `estimate_pose` needs, and the file it came from."""
 
+    source: str
     keypoints: GaussianKeypoints
     points_m: NDArray[np.float64]  # (K, 3) runway frame
     camera: Camera
 
     def solve(self) -> PoseEstimate:
-        """The estimate, whatever its status."""
-        return estimate_pose(self.keypoints, self.points_m, self.camera)
+        """The estimate, whatever its status. Raises InputError naming the file if there is nothing to solve."""
+        try:
+            return estimate_pose(self.keypoints, self.points_m, self.camera)
+        except InputError as error:
+            raise InputError(f"{self.source}: {error}") from error
 
 
 def read_problem(path: str | Path) -> PoseProblem:
@@ -46,12 +50,12 @@ def read_problem(path: str | Path) -> PoseProblem:
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a JSON object with camera, keypoints_px, sigma_px and runway")
     try:
-        return _problem(content)
+        return _problem(content, str(path))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def _problem(content: dict[str, Any]) -> PoseProblem:
+def _problem(content: dict[str, Any], source: str) -> PoseProblem:
     camera = _build(Camera, _field(content, "camera"), "camera")
     if "points_m" in content:
         points = np.asarray(content["points_m"])
@@ -62,7 +66,15 @@ def _problem(content: dict[str, Any]) -> PoseProblem:
         keypoints = GaussianKeypoints(mean, content["cov_px"])
     else:
         keypoints = GaussianKeypoints.from_sigma(mean, _field(content, "sigma_px"))
-    return PoseProblem(keypoints, points, camera)
+    _check_outline(keypoints)
+    return PoseProblem(source, keypoints, points, camera)
+
+
+def _check_outline(keypoints: GaussianKeypoints) -> None:
+    """Refuse keypoints on one line, to within their sigma: a plane seen edge-on fixes no pose."""
+    off_line = np.linalg.svd(keypoints.mean_px - keypoints.mean_px.mean(axis=0), compute_uv=False)[-1]
+    if off_line < keypoints.sigma_px.max():
+        raise InputError(f"keypoints_px: all lie on one line, to {off_line:.2g} px; corners must span an area")
 
 
 def _field(content: dict[str, Any], name: str) -> Any:

@@ -1,0 +1,226 @@
+"""Wrong input is one line that names what is wrong, exit status 2, and nothing half-written."""
+
+import json
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+import shortfinal as sf
+from shortfinal.cli import main
+from shortfinal.crops import box_around
+from shortfinal.demo import CAMERA, RUNWAY, approach_pose, demo_scene, render_frame
+
+CORNERS = sf.project(CAMERA, approach_pose(60), RUNWAY.corners)
+CAMERA_FIELDS = {"width": 960, "height": 720, "fx": CAMERA.fx, "fy": CAMERA.fy, "cx": CAMERA.cx, "cy": CAMERA.cy}
+PROBLEM = {
+    "camera": CAMERA_FIELDS,
+    "runway": {"length_m": 2000.0, "width_m": 45.0},
+    "keypoints_px": CORNERS.tolist(),
+    "sigma_px": 0.5,
+}
+
+
+def call(capsys, *arguments):
+    """Exit status, standard output, standard error."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["shortfinal", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+            raise SystemExit(0)
+    out, err = capsys.readouterr()
+    return end.value.code or 0, out, err
+
+
+def refused(capsys, *arguments):
+    """The one line of a refusal."""
+    status, out, err = call(capsys, *arguments)
+    assert status == 2
+    assert "Traceback" not in out + err
+    assert err.startswith("shortfinal: ")
+    assert err.count("\n") == 1
+    return err
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two frames with boxes, and their camera."""
+    scene = demo_scene()
+    lines = ["image,left,top,right,bottom"]
+    for number in (60, 80):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), render_frame(scene, number)[..., ::-1])
+        box = box_around(sf.project(CAMERA, approach_pose(number), RUNWAY.corners))
+        lines.append(f"{number}.png," + ",".join(f"{v:.1f}" for v in box))
+    (tmp_path / "labels.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "camera.toml").write_text("\n".join(f"{k} = {v}" for k, v in CAMERA_FIELDS.items()))
+    return tmp_path
+
+
+def run_arguments(folder):
+    return ("run", folder, "--camera", folder / "camera.toml", "--size", "2000x45", "--out", folder / "out")
+
+
+def problem_file(tmp_path, **changes):
+    path = tmp_path / "problem.json"
+    path.write_text(json.dumps(PROBLEM | changes))
+    return path
+
+
+def test_run_over_a_folder(folder, capsys):
+    status, out, _ = call(capsys, *run_arguments(folder), "--json")
+    assert status == 0
+    assert json.loads(out)["decisions"]["use"] == 2
+    lines = [json.loads(line) for line in (folder / "out" / "frames.jsonl").read_text().splitlines()]
+    assert [line["image"] for line in lines] == ["60.png", "80.png"]
+    for line, number in zip(lines, (60, 80)):
+        error = np.array(line["position_m"]) - approach_pose(number).position_m
+        assert abs(error / np.sqrt(np.diag(line["pose_cov"])[:3])).max() < 4
+    assert cv2.imread(str(folder / "out" / "contact_sheet.png")) is not None
+    assert not list((folder / "out").glob("*partial*"))
+
+
+def test_run_prints_a_table_for_people(folder, capsys):
+    status, out, _ = call(capsys, *run_arguments(folder))
+    assert status == 0
+    assert "2 frames: 2 use" in out
+
+
+def test_solve(tmp_path, capsys):
+    status, out, _ = call(capsys, "solve", problem_file(tmp_path), "--json")
+    assert status == 0
+    record = json.loads(out)
+    assert record["position_m"] == pytest.approx(approach_pose(60).position_m, abs=1e-5)
+    assert record["decision"] == "use"
+    assert call(capsys, "solve", problem_file(tmp_path))[0] == 0
+
+
+COLLINEAR = [[100.0 + 50 * k, 300.0 + 10 * k] for k in range(4)]
+NEGATIVE = np.diag([1.0, 1, 1, -1, 1, 1, 1, 1]).tolist()
+SKEW = (np.eye(8) + np.diag([0.5] * 7, 1)).tolist()
+BEHIND = [[-5000.0, 22.5, 300], [-5000, -22.5, 300], [-7000, -22.5, 300], [-7000, 22.5, 300]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"keypoints_px": CORNERS[:3].tolist(), "points_m": RUNWAY.corners[:3].tolist()}, "at least four"),
+        ({"keypoints_px": COLLINEAR}, "all lie on one line"),
+        ({"points_m": [[1000.0 * k, 0, 0] for k in range(4)]}, "no pose"),
+        ({"keypoints_px": (CORNERS * [1, -1] + [0, 720]).tolist()}, "no pose"),
+        ({"sigma_px": 0}, "keypoint 0 u is 0"),
+        ({"sigma_px": -0.5}, "keypoint 0 u is -0.5"),
+        ({"cov_px": NEGATIVE}, "variance of keypoint 1 v is -1"),
+        ({"cov_px": SKEW}, "not symmetric"),
+        ({"keypoints_px": [[1.0, float("nan")], *CORNERS[1:].tolist()]}, r"mean_px: entry \[0, 1\] is nan"),
+        ({"keypoints_px": "corners"}, "mean_px: expected"),
+        ({"camera": {"width": 9}}, "camera: "),
+        ({"camera": CAMERA_FIELDS | {"fx": -3}}, "must be positive"),
+        ({"camera": CAMERA_FIELDS | {"fx": "wide"}}, "camera"),
+        ({"runway": {"length_m": -5, "width_m": 45}}, "length_m is -5"),
+        ({"points_m": [["a", 0, 0]] * 4}, "points"),
+        ({"runway": 7}, "runway"),
+    ],
+)
+def test_problems_that_are_none(tmp_path, capsys, changes, message):
+    err = refused(capsys, "solve", problem_file(tmp_path, **changes))
+    assert "problem.json" in err
+    import re
+
+    assert re.search(message, err), err
+
+
+def test_points_behind_the_camera(tmp_path, capsys):
+    # Left and right exchanged: only a camera behind the image, or under the ground, sees it so.
+    mirrored = CORNERS[[1, 0, 3, 2]].tolist()
+    err = refused(capsys, "solve", problem_file(tmp_path, keypoints_px=mirrored))
+    assert "no pose" in err
+    assert "behind" in err
+
+
+def test_files_that_are_missing_or_not_what_they_should_be(folder, capsys):
+    assert "no such folder" in refused(capsys, "run", folder / "nowhere")
+    assert "cannot read the problem" in refused(capsys, "solve", folder / "absent.json")
+    (folder / "text.json").write_text("{")
+    assert "not a JSON file" in refused(capsys, "solve", folder / "text.json")
+    (folder / "list.json").write_text("[]")
+    assert "expected a JSON object" in refused(capsys, "solve", folder / "list.json")
+    assert "cannot read the labels" in refused(
+        capsys, "audit", folder / "absent.csv", "--runways", folder / "labels.csv"
+    )
+    assert "no column" in refused(capsys, "audit", folder / "labels.csv", "--runways", folder / "labels.csv")
+    assert "no such model" in refused(capsys, *run_arguments(folder), "--model", folder / "absent.onnx")
+    assert "not an ONNX model" in refused(capsys, *run_arguments(folder), "--model", folder / "labels.csv")
+    (folder / "file").write_text("")
+    arguments = [*run_arguments(folder)[:-1], folder / "file"]
+    assert "cannot make the output folder" in refused(capsys, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("60.png,nan,1,5,5", "line 2: left is 'nan'"),
+        ("60.png,a,1,5,5", "line 2: left is 'a'"),
+        ("60.png,9,1,5,5", "line 2: the box must have"),
+        ("60.png,1,1,5", "line 2: bottom is None"),
+        ("61.png,1,1,5,5", "line 2: image '61.png' is not in"),
+        (",1,1,5,5", "line 2: image '' is not in"),
+    ],
+)
+def test_box_files(folder, capsys, line, message):
+    (folder / "labels.csv").write_text(f"image,left,top,right,bottom\n{line}\n")
+    err = refused(capsys, *run_arguments(folder))
+    assert "labels.csv" in err
+    assert message in err
+    assert not (folder / "out" / "frames.jsonl").exists()
+
+
+def test_an_unreadable_picture_leaves_nothing_behind(folder, capsys):
+    (folder / "80.png").write_bytes((folder / "80.png").read_bytes()[:40])
+    assert "80.png: cannot be read as an image" in refused(capsys, *run_arguments(folder))
+    assert list((folder / "out").iterdir()) == []
+
+
+def test_a_picture_of_another_size(folder, capsys):
+    cv2.imwrite(str(folder / "80.png"), np.zeros((10, 20, 3), np.uint8))
+    assert "80.png: 20 x 10 pixels, but the camera has 960 x 720" in refused(capsys, *run_arguments(folder))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("width = 960", "lacks height"),
+        ("width = [", "not a TOML file"),
+        (None, "cannot read the camera"),
+        ("width=960\nheight=720\nfx=1.0\nfy=-1.0\ncx=0\ncy=0", "must be positive"),
+        ("width=960\nheight=720\nfx='a'\nfy=1.0\ncx=0\ncy=0", "fx is 'a'"),
+        ("width=960.5\nheight=720\nfx=1.0\nfy=1.0\ncx=0\ncy=0", "width is 960.5; it must be a whole number"),
+        ("width=960\nheight=720\nfx=1.0\nfy=1.0\ncx=0\ncy=0\nzoom=2", "unknown field 'zoom'"),
+        ("width=960\nheight=720\nfx=1.0\nfy=1.0\ncx=0\ncy=0\ndistortion=3", "distortion is 3"),
+        ("width=960\nheight=720\nfx=1.0\nfy=1.0\ncx=0\ncy=0\ndistortion=[1,2]", "2 coefficients"),
+    ],
+)
+def test_camera_files(folder, capsys, text, message):
+    (folder / "camera.toml").unlink()
+    if text is not None:
+        (folder / "camera.toml").write_text(text)
+    err = refused(capsys, *run_arguments(folder))
+    assert "camera.toml" in err
+    assert message in err
+
+
+def test_runways_that_are_unknown(folder, capsys, monkeypatch):
+    monkeypatch.delenv("SHORTFINAL_RUNWAYS", raising=False)
+    base = ("run", folder, "--camera", folder / "camera.toml", "--out", folder / "out")
+    assert "no runway; pass --runway" in refused(capsys, *base)
+    assert "no runway database" in refused(capsys, *base, "--runway", "LFPO/24")
+    (folder / "runways.json").write_text('{"LFPO": {"06": {}}}')
+    err = refused(capsys, *base, "--runway", "LFPO/24", "--runways", folder / "runways.json")
+    assert "unknown runway 'LFPO/24' among 1; nearest: LFPO/06" in err
+    assert "--size: '2000'" in refused(capsys, *base, "--size", "2000")
+
+
+def test_an_option_that_does_not_exist(capsys):
+    status, _, err = call(capsys, "demo", "--speed", "3")
+    assert status == 2
+    assert "Traceback" not in err

@@ -1,0 +1,97 @@
+import json
+
+import numpy as np
+import pytest
+
+import shortfinal as sf
+from shortfinal.crops import box_around
+from shortfinal.demo import CAMERA, RUNWAY, Fault, approach_pose, demo_scene, inject, render_frame
+from shortfinal.integrity import Decision
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    return sf.LandingPipeline(sf.KeypointDetector(), RUNWAY, CAMERA)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return render_frame(demo_scene(), 80)
+
+
+TRUTH = approach_pose(80)
+BOX = box_around(sf.project(CAMERA, TRUTH, RUNWAY.corners))
+
+
+def test_one_frame_in_keypoints_pose_and_verdict_out(pipeline, frame):
+    result = pipeline.step(frame, 12.5, box=BOX)
+    assert result.verdict.decision is Decision.USE
+    assert result.timestamp_s == 12.5
+    error = result.estimate.pose.minus(TRUTH)
+    assert error @ np.linalg.inv(result.estimate.cov) @ error < 22.5  # χ²(6) at 0.1 %
+    assert set(result.timings_ms) == {"detect", "solve", "doubt"}
+
+
+def test_a_prior_pose_is_as_good_as_a_box(pipeline, frame):
+    near = TRUTH.plus([10, 3, -2, 0.004, 0.003, -0.004])
+    one, other = pipeline.step(frame, box=BOX), pipeline.step(frame, prior=near)
+    shift = one.keypoints.mean_px - other.keypoints.mean_px
+    assert np.abs(shift / one.keypoints.sigma_px).max() < 3
+
+
+def test_without_a_box_it_looks_where_the_last_accepted_frame_was(frame):
+    fresh = sf.LandingPipeline(sf.KeypointDetector(), RUNWAY, CAMERA)
+    lost = fresh.step(frame)
+    assert lost.verdict.decision is Decision.NOT_MONITORED
+    assert "where to look is not known" in lost.verdict.reasons[0]
+    assert lost.estimate is None
+    fresh.step(frame, box=BOX)
+    assert fresh.step(frame).verdict.decision is Decision.USE
+
+
+def test_a_slid_corner_is_refused(pipeline, frame):
+    result = pipeline.step(frame, box=BOX, alter=inject(Fault.NEAR_CORNER, TRUTH))
+    assert result.verdict.decision is Decision.DO_NOT_USE
+    assert "do not fit the runway" in result.verdict.reasons[0]
+
+
+def test_the_record_is_plain_json(pipeline, frame):
+    record = json.loads(json.dumps(pipeline.step(frame, box=BOX).to_dict(), allow_nan=False))
+    assert record["decision"] == "use"
+    assert np.shape(record["pose_cov"]) == (6, 6)
+
+
+@pytest.mark.parametrize(
+    ("where", "reason"),
+    [
+        ({"box": [-400, 10, -300, 50]}, "outside the frame"),
+        ({"box": [5, 5, 5, 5]}, "not left < right"),
+        ({"box": [0, 0, float("nan"), 5]}, "box: entry"),
+        ({"prior": sf.Pose.from_attitude([500.0, 0, 60])}, "behind the camera"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_not_monitored(pipeline, frame, where, reason):
+    result = pipeline.step(frame, **where)
+    assert result.verdict.decision is Decision.NOT_MONITORED
+    assert reason in result.verdict.reasons[0]
+
+
+def test_a_picture_without_a_runway_is_not_accepted_with_confidence(pipeline):
+    # The network has no out-of-scope output yet; what it says of noise must not pass as a sharp pose.
+    noise = np.random.default_rng(0).integers(0, 256, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
+    result = pipeline.step(noise, box=BOX)
+    refused = result.verdict.decision is not Decision.USE
+    assert refused or result.keypoints.sigma_px.min() > 2.0
+
+
+@pytest.mark.parametrize(
+    ("frame", "time", "message"),
+    [
+        (np.zeros((10, 10, 3), np.uint8), 0.0, "10 x 10 pixels; the camera has 960 x 720"),
+        (np.zeros((720, 960), np.uint8), 0.0, "expected \\(height, width, 3\\)"),
+        (np.zeros((720, 960, 3), np.uint8), float("nan"), "timestamp_s"),
+    ],
+)
+def test_wrong_frames_are_refused(pipeline, frame, time, message):
+    with pytest.raises(sf.InputError, match=message):
+        pipeline.step(frame, time, box=BOX)
