@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import shortfinal as sf
-from shortfinal.data.dataset import read_dataset, render_example, write_dataset
+from shortfinal.data.dataset import plan_shot, read_dataset, write_dataset
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +37,16 @@ def test_rendering_goes_on_where_it_stopped(folder, tmp_path):
     assert sorted(p.name for p in (tmp_path / "images").iterdir()) == [f"{i:06d}.png" for i in range(6)]
 
 
+def test_a_data_set_grows_without_rendering_again(folder, tmp_path):
+    write_dataset(tmp_path, 2, seed=3)
+    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "images").iterdir()}
+    write_dataset(tmp_path, 4, seed=3)
+    assert all(p.stat().st_mtime_ns == time for p, time in before.items())
+    assert len(read_dataset(tmp_path)) == 4
+
+
 def test_an_example_follows_from_its_number():
-    np.testing.assert_array_equal(render_example(5, 2)[0].image, render_example(5, 2)[0].image)
+    np.testing.assert_array_equal(plan_shot(5, 2).render().image, plan_shot(5, 2).render().image)
 
 
 def test_another_seed_is_not_mixed_in(folder):

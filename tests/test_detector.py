@@ -104,14 +104,17 @@ def test_an_answer_that_is_not_finite_is_refused(tmp_path):
     ("metadata", "message"),
     [
         ({}, "not one of ours"),
-        ({METADATA_KEY: "{}"}, "lacks 'format'"),
-        ({METADATA_KEY: "no json"}, "description lacks"),
+        ({METADATA_KEY: "{}"}, "lacks format, size"),
+        ({METADATA_KEY: "no json"}, "is not JSON"),
+        ({METADATA_KEY: "wrong size"}, "of no use"),
         ({METADATA_KEY: "format 2"}, "this version reads 1"),
     ],
 )
 def test_a_model_that_does_not_describe_itself_is_refused(tmp_path, metadata, message):
     if metadata.get(METADATA_KEY) == "format 2":
         metadata = {METADATA_KEY: json.dumps(json.loads(sf.KeypointDetector().info.to_json()) | {"format": 2})}
+    if metadata.get(METADATA_KEY) == "wrong size":
+        metadata = {METADATA_KEY: json.dumps(json.loads(sf.KeypointDetector().info.to_json()) | {"size": "224"})}
     with pytest.raises(sf.InputError, match=message):
         sf.KeypointDetector(small_model(tmp_path / "m.onnx", metadata))
 
@@ -138,11 +141,11 @@ def test_the_window_must_have_the_models_size():
 
 
 def test_the_shipped_model_finds_the_corners_of_scenes_it_never_saw():
-    from shortfinal.data.dataset import render_example
+    from shortfinal.data.dataset import plan_shot
 
     detector, errors, sigmas = sf.KeypointDetector(), [], []
     for index in range(40):
-        example = render_example(987654, index)[0]
+        example = plan_shot(987654, index).render()
         box = np.concatenate([example.corners_px.min(axis=0), example.corners_px.max(axis=0)])
         window = centre_crop(box, detector.info.margin, detector.info.size)
         found = detector.detect(example.image, window)

@@ -104,8 +104,8 @@ def test_training_resumes_to_the_same_weights(recipe, tmp_path):
     train(halves)
     one, other = (torch.load(tmp_path / n / "last.pt", weights_only=True) for n in ("whole", "halves"))
     assert one["step"] == other["step"] == 4
-    for name, weight in one["model"].items():
-        torch.testing.assert_close(weight, other["model"][name], rtol=1e-4, atol=1e-5)
+    for name, weight in one["net"].items():
+        torch.testing.assert_close(weight, other["net"][name], rtol=1e-4, atol=1e-5)
     with (tmp_path / "halves" / "log.csv").open() as file:
         assert [int(float(row["step"])) for row in csv.DictReader(file)] == [2, 4]
 

@@ -47,14 +47,25 @@ class ModelInfo:
         """Parse and check. Raises InputError naming the field that is missing or of another format."""
         try:
             content = json.loads(text)
-            values = {f.name: content[f.name] for f in fields(cls)}
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{source}: its shortfinal description lacks {error}; export it again") from error
-        if values["format"] != FORMAT:
-            raise InputError(f"{source}: description format {values['format']}; this version reads {FORMAT}")
+        except ValueError as error:
+            raise InputError(f"{source}: its shortfinal description is not JSON; export it again") from error
+        missing = (
+            [f.name for f in fields(cls) if f.name not in content] if isinstance(content, dict) else ["all fields"]
+        )
+        if missing:
+            raise InputError(f"{source}: its shortfinal description lacks {', '.join(missing)}; export it again")
+        if content["format"] != FORMAT:
+            raise InputError(f"{source}: description format {content['format']}; this version reads {FORMAT}")
+        values = {f.name: content[f.name] for f in fields(cls)}
         for name in ("mean", "std", "keypoints"):
-            values[name] = tuple(values[name])
-        return cls(**values)
+            values[name] = tuple(values[name]) if isinstance(values[name], list) else ()
+        info = cls(**values)
+        numbers = all(isinstance(v, (int, float)) for v in (*info.mean, *info.std, info.margin))
+        if not (isinstance(info.size, int) and len(info.mean) == len(info.std) == 3 and info.keypoints and numbers):
+            raise InputError(
+                f"{source}: its shortfinal description has a size, mean, std, margin or keypoints of no use"
+            )
+        return info
 
     def to_json(self) -> str:
         """The text `from_json` reads."""
@@ -157,7 +168,7 @@ def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo]:
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
     try:
-        session = onnxruntime.InferenceSession(str(source), options, providers=onnxruntime.get_available_providers())
+        session = onnxruntime.InferenceSession(str(source), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime has no common base class for what a broken file raises
         raise InputError(f"{source}: not an ONNX model: {str(error).splitlines()[0][:120]}") from error
     text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)

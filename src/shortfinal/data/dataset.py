@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shortfinal.crops import bogo_crop, box_around
-from shortfinal.data.scene import random_scene, random_sensor, render
+from shortfinal.data.scene import Scene, Sensor, random_scene, random_sensor, render
 from shortfinal.errors import InputError
 from shortfinal.files import make_folder, write_png, write_whole
 from shortfinal.geometry import Camera, Pose, project
@@ -60,8 +60,37 @@ def random_approach(rng: np.random.Generator, runway: Runway) -> Pose:
     return Pose.from_attitude([-distance, distance * np.tan(lateral), height], *attitude)
 
 
-def render_example(seed: int, index: int) -> tuple[Example, dict[str, object]]:
-    """Example number `index` of the data set `seed`, and its row.
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A picture about to be taken."""
+
+    scene: Scene
+    runway: Runway
+    camera: Camera  # of the picture
+    pose: Pose
+    sensor: Sensor
+    noise_seed: int
+
+    @property
+    def corners_px(self) -> Array:
+        """Where the corners will be (4, 2)."""
+        return project(self.camera, self.pose, self.runway.corners)
+
+    def render(self) -> Example:
+        """Take it."""
+        image = render(self.scene, self.camera, self.pose, self.sensor, samples=3, seed=self.noise_seed)
+        return Example(image, self.corners_px)
+
+    def row(self, name: str) -> dict[str, str]:
+        """Its line in labels.csv, to nine digits."""
+        c, r = self.camera, self.runway
+        numbers = [c.width, c.height, c.fx, c.fy, c.cx, c.cy, r.length_m, r.width_m]
+        numbers += [*self.pose.position_m, *self.pose.attitude, *self.corners_px.ravel()]
+        return dict(zip(COLUMNS, [name, *(f"{n:.9g}" for n in numbers)], strict=True))
+
+
+def plan_shot(seed: int, index: int) -> Shot:
+    """Picture number `index` of the data set `seed`.
 
     The runway's box is 11 to 200 pixels long (log-uniform), as a camera sees it from afar or near; the
     picture holds it with room for the training crop to move.
@@ -75,18 +104,9 @@ def render_example(seed: int, index: int) -> tuple[Example, dict[str, object]]:
     side = float(np.exp(rng.uniform(np.log(11.0), np.log(200.0))))
     zoom = side / float((box[2:] - box[:2]).max())
     camera = Camera(1, 1, unit.fx * zoom, unit.fy * zoom, 0.0, 0.0)
-    corners = project(camera, pose, runway.corners)
     out = int(np.ceil(max(1.3 * side, min(1.9 * side, 235.0)))) + 2
-    window = bogo_crop(box_around(corners), out / side, out, rng, slack=0.06)
-    view = camera.view(window)
-    image = render(scene, view, pose, random_sensor(rng), samples=3, seed=int(rng.integers(2**31)))
-    corners = project(view, pose, runway.corners)
-    attitude = pose.attitude
-    values = [
-        f"images/{index:06d}.png", view.width, view.height, view.fx, view.fy, view.cx, view.cy,
-        runway.length_m, runway.width_m, *pose.position_m, *attitude, *corners.ravel(),
-    ]  # fmt: skip
-    return Example(image, corners), dict(zip(COLUMNS, values, strict=True))
+    window = bogo_crop(box_around(project(camera, pose, runway.corners)), out / side, out, rng, slack=0.06)
+    return Shot(scene, runway, camera.view(window), pose, random_sensor(rng), int(rng.integers(2**31)))
 
 
 def write_dataset(
@@ -96,43 +116,40 @@ def write_dataset(
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
-    """Render `count` examples into the folder `out`; pictures already there are kept.
+    """Render `count` pictures into the folder `out`; those already there are kept.
 
     Returns the path of labels.csv, which appears when all are done. Raises InputError if the folder
     holds a data set of another seed.
     """
     folder = Path(out)
-    stamp = folder / "dataset.json"
-    if stamp.exists() and json.loads(stamp.read_text())["seed"] != seed:
-        raise InputError(f"{folder}: holds a data set of another seed; choose an empty folder or the same --seed")
     make_folder(folder / "images")
-    write_whole(stamp, json.dumps({"seed": seed}))
+    _claim(folder / "dataset.json", seed)
 
-    def one(index: int) -> dict[str, object]:
-        target = folder / f"images/{index:06d}.png"
-        record = target.with_suffix(".json")
-        if target.exists() and record.exists():
-            row: dict[str, object] = json.loads(record.read_text())
-        else:
-            example, row = render_example(seed, index)
-            row = {k: float(f"{v:.9g}") if isinstance(v, float) else v for k, v in row.items()}
-            write_whole(record, json.dumps(row))
-            write_png(target, example.image)
+    def one(index: int) -> dict[str, str]:
+        name = f"images/{index:06d}.png"
+        shot = plan_shot(seed, index)
+        if not (folder / name).exists():
+            write_png(folder / name, shot.render().image)
         if progress:
             progress(index)
-        return row
+        return shot.row(name)
 
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         rows = list(pool.map(one, range(count)))
-    labels = folder / "labels.csv"
     table = io.StringIO()
     writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    write_whole(labels, table.getvalue())
-    for record in (folder / "images").glob("*.json"):
-        record.unlink()
-    return labels
+    write_whole(folder / "labels.csv", table.getvalue())
+    return folder / "labels.csv"
+
+
+def _claim(stamp: Path, seed: int) -> None:
+    """Note the seed in the folder, or refuse a folder of another seed."""
+    text = json.dumps({"seed": seed})
+    if stamp.exists() and stamp.read_text() != text:
+        raise InputError(f"{stamp.parent}: holds a data set of another seed; choose an empty folder or the same --seed")
+    write_whole(stamp, text)
 
 
 class RenderedDataset:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shortfinal.errors import InputError, JobError
 from shortfinal.files import partial_of
 
 Image = NDArray[np.uint8]
@@ -42,7 +43,10 @@ class JsonlWriter(_Partial):
 
     def __init__(self, path: str | Path) -> None:
         super().__init__(path)
-        self._file = self.partial.open("w", encoding="utf-8")
+        try:
+            self._file = self.partial.open("w", encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be written: {error.strerror}") from error
 
     def write(self, record: dict[str, Any]) -> None:
         """Append one record. NaN and infinity are no JSON, and an error."""
@@ -68,6 +72,8 @@ class VideoWriter(_Partial):
                 fourcc = cv2.VideoWriter.fourcc(*codec)
                 if self._writer.open(str(self.partial), cv2.CAP_FFMPEG, fourcc, self._fps, size):
                     break
+            else:
+                raise JobError(f"{self.path}: this build of OpenCV can write neither H.264 nor MPEG-4 video")
         self._writer.write(np.ascontiguousarray(picture[..., ::-1]))
 
     def close(self) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from shortfinal.detector import FORMAT, METADATA_KEY, ModelInfo
 from shortfinal.errors import InputError, JobError
 from shortfinal.keypoints import CORNER_NAMES
-from shortfinal.train.fit import MEAN, STD, load_checkpoint, validation_figures
+from shortfinal.train.fit import MEAN, STD, load_checkpoint
 from shortfinal.train.model import KeypointNet, to_pixels, variance_px
 
 # How near ONNX must come to torch, in units of the input's side. (torch itself is off by 4e-6 of it
@@ -61,7 +61,7 @@ def export(checkpoint: str | Path, out: str | Path) -> ModelInfo:
         format=FORMAT, size=recipe["size"], mean=MEAN, std=STD, keypoints=CORNER_NAMES, covariance="diagonal",
         margin=recipe["margin"], backbone=recipe["backbone"],
         training={"steps": state["step"], "batch": recipe["batch"], "seed": recipe["seed"], "data": "rendered scenes"},
-        figures=validation_figures(checkpoint),
+        figures=state["history"][-1],
     )  # fmt: skip
     target = Path(out)
     with tempfile.TemporaryDirectory(dir=_folder_of(target)) as scratch:

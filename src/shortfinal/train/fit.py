@@ -1,12 +1,11 @@
-"""`shortfinal train`: fit a KeypointNet to a rendered data set, resumable at any moment."""
+"""`shortfinal train`: fit a KeypointNet to a rendered data set, resumable after a stop or a kill."""
 
 from __future__ import annotations
 
 import csv
 import io
-import json
-import os
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from lightning.fabric import Fabric
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -46,7 +46,7 @@ class Recipe:
     size: int = 224  # side of the crop, px
     margin: float = 1.4  # of the evaluation crop; training draws from 1.15 to 1.9
     batch: int = 32
-    steps: int = 15000
+    steps: int = 10000
     warm_up: float = 0.1  # share of the steps before the variance enters the mean's loss
     learning_rate: float = 2e-3
     weight_decay: float = 0.02
@@ -130,7 +130,7 @@ class _Held(Dataset[Batch]):
         return torch.from_numpy(image), torch.from_numpy(window.apply(example.corners_px).astype(np.float32))
 
 
-def validate(model: torch.nn.Module, batches: DataLoader[Batch], size: int) -> dict[str, float]:
+def validate(model: torch.nn.Module, batches: Iterable[Batch], size: int) -> dict[str, float]:
     """Errors in pixels of the crop, per coordinate, and how honest the predicted sigma is."""
     model.eval()
     errors, variances = [], []
@@ -156,24 +156,26 @@ def validate(model: torch.nn.Module, batches: DataLoader[Batch], size: int) -> d
 class Run:
     """A training run: its parts, its place on disk, and how to go on from there."""
 
+    _PARTS = ("net", "average", "optimizer", "schedule")
+
     def __init__(self, recipe: Recipe) -> None:
         self.recipe, self.folder = recipe, Path(recipe.out)
+        self.fabric = Fabric(accelerator="auto", devices=1)
         torch.manual_seed(recipe.seed)
-        self.model = KeypointNet(recipe.backbone, width=recipe.width)
-        self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema), use_buffers=True)
-        self.optimizer = torch.optim.AdamW(
-            self.model.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay
-        )
+        self.net = KeypointNet(recipe.backbone, width=recipe.width)
+        self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        optimizer = torch.optim.AdamW(self.net.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
         self.schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self.optimizer, recipe.learning_rate, total_steps=recipe.steps + 1, pct_start=0.08
+            optimizer, recipe.learning_rate, total_steps=recipe.steps + 1, pct_start=0.08
         )
-        self.step, self.best = 0, float("inf")
+        self.model, self.optimizer = self.fabric.setup(self.net, optimizer)
+        self.average = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema), use_buffers=True)
+        self.step, self.history = 0, list[dict[str, float]]()
 
     def save(self, name: str) -> None:
         """Write a checkpoint whole or not at all."""
-        parts = {p: getattr(self, p).state_dict() for p in ("model", "average", "optimizer", "schedule")}
-        state = parts | {"step": self.step, "best": self.best, "recipe": asdict(self.recipe)}
+        parts = {part: getattr(self, part).state_dict() for part in self._PARTS}
+        state = parts | {"step": self.step, "history": self.history, "recipe": asdict(self.recipe)}
         content = io.BytesIO()
         torch.save(state, content)
         write_whole(self.folder / name, content.getvalue())
@@ -185,12 +187,12 @@ class Run:
             return False
         state = load_checkpoint(path)
         was, now = state["recipe"], asdict(self.recipe)
-        changed = [k for k in now if was.get(k) != now[k] and k not in ("data", "validation", "out", "workers")]
+        changed = [k for k in now if was.get(k) != now[k] and k not in ("out", "workers")]
         if changed:
             raise InputError(f"{path}: was made with another {', '.join(changed)}; choose another --out")
-        for part in ("model", "average", "optimizer", "schedule"):
+        for part in self._PARTS:
             getattr(self, part).load_state_dict(state[part])
-        self.step, self.best = state["step"], state["best"]
+        self.step, self.history = state["step"], state["history"]
         return True
 
     def advance(self, image: Tensor, corners: Tensor) -> float:
@@ -204,13 +206,26 @@ class Run:
         else:
             loss = gaussian_nll(error, log_variance)
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self.model.parameters(), 5.0)
+        self.fabric.backward(loss)
+        self.fabric.clip_gradients(self.model, self.optimizer, max_norm=5.0)
         self.optimizer.step()
         self.schedule.step()
-        self.average.update_parameters(self.model)
+        self.average.update_parameters(self.net)
         self.step += 1
         return float(loss.detach())
+
+    def record(self, figures: dict[str, float]) -> None:
+        """Keep a validation: last.pt always, best.pt if it is the best yet, and the table of all."""
+        best = min((row["nll"] for row in self.history), default=math.inf)
+        self.history.append(figures)
+        if figures["nll"] < best:
+            self.save("best.pt")
+        table = io.StringIO()
+        writer = csv.DictWriter(table, figures.keys(), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.history)
+        write_whole(self.folder / "log.csv", table.getvalue())
+        self.save("last.pt")  # last of all: what is lost by a kill before it is done again, not twice
 
 
 def load_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -227,43 +242,28 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def train(recipe: Recipe, console: Console | None = None) -> dict[str, float]:
-    """Train, or go on training; returns the figures of the best checkpoint (out/best.pt).
+    """Train, or go on from the last validation; returns the figures of the best (out/best.pt).
 
     Keeps out/last.pt for resuming and out/log.csv, a row at each validation.
     """
     console = console or Console()
-    folder = make_folder(recipe.out)
+    make_folder(recipe.out)
     run = Run(recipe)
     if run.resume():
         console.print(f"going on from step {run.step}")
-    held = DataLoader(_Held(recipe), batch_size=64)
+    held: Any = run.fabric.setup_dataloaders(DataLoader(_Held(recipe), batch_size=64))
     draws = _Draws(recipe, run.step * recipe.batch)
-    batches: Iterator[Batch] = iter(DataLoader(draws, batch_size=recipe.batch, num_workers=recipe.workers))
-    figures: dict[str, float] = {}
+    batches: Any = run.fabric.setup_dataloaders(DataLoader(draws, batch_size=recipe.batch, num_workers=recipe.workers))
+    smooth = math.nan
     with _bar(console) as bar:
         task = bar.add_task("training", total=recipe.steps, completed=run.step, note="")
-        smooth = float("nan")
         for image, corners in batches:
             loss = run.advance(image, corners)
-            smooth = loss if smooth != smooth else 0.98 * smooth + 0.02 * loss
-            bar.update(task, completed=run.step, note=f"loss {smooth:.3f}" + _brief(figures))
+            smooth = loss if math.isnan(smooth) else 0.98 * smooth + 0.02 * loss
+            bar.update(task, completed=run.step, note=f"loss {smooth:.3f}" + _brief(run.history))
             if run.step % recipe.validate_every == 0 or run.step == recipe.steps:
-                figures = validate(run.average, held, recipe.size)
-                _log(folder / "log.csv", {"step": run.step, "loss": smooth, **figures})
-                if figures["nll"] < run.best:
-                    run.best = figures["nll"]
-                    run.save("best.pt")
-                    write_whole(folder / "best.json", json.dumps(figures, indent=1))
-                run.save("last.pt")
-    best: dict[str, float] = json.loads((folder / "best.json").read_text())
-    return best
-
-
-def validation_figures(checkpoint: str | Path) -> dict[str, float]:
-    """What `train` measured on the held-out scenes when it wrote the best checkpoint; {} for another."""
-    record = Path(checkpoint).with_suffix(".json")
-    figures: dict[str, float] = json.loads(record.read_text()) if record.exists() else {}
-    return figures
+                run.record({"step": run.step, "loss": smooth, **validate(run.average, held, recipe.size)})
+    return min(run.history, key=lambda row: row["nll"])
 
 
 def _bar(console: Console) -> Progress:
@@ -276,17 +276,6 @@ def _bar(console: Console) -> Progress:
     return Progress(*columns, console=console)
 
 
-def _brief(figures: dict[str, float]) -> str:
-    return f" · held out: median {figures['median_px']:.2f} px, nll {figures['nll']:.3f}" if figures else ""
-
-
-def _log(path: Path, row: dict[str, float]) -> None:
-    """Append a row and flush it, so that the log survives a kill."""
-    new = not path.exists()
-    with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, row.keys())
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
-        file.flush()
-        os.fsync(file.fileno())
+def _brief(history: list[dict[str, float]]) -> str:
+    last = history[-1] if history else None
+    return f" · held out: median {last['median_px']:.2f} px, nll {last['nll']:.3f}" if last else ""
