@@ -65,6 +65,7 @@ def demo(out: Out = Path("results/demo"), model: Model = None, as_json: Json = F
         _print_json(_demo_summary(flown) | {"out": str(out)})
         return
     rows: list[Flown] = []
+    _compile(scenes=True)
     with Live(console=console, refresh_per_second=4, vertical_overflow="crop") as live:
 
         def seen(frame: Flown) -> None:
@@ -73,7 +74,7 @@ def demo(out: Out = Path("results/demo"), model: Model = None, as_json: Json = F
             live.update(Group(_demo_table(rows[-14:]), Text(progress, style="dim")))
 
         flown = run_demo(out, seen, model)
-        live.update(_demo_table([f for f in flown if f.number % 7 == 3]))
+        live.update(_demo_table([f for f in flown if f.number % 7 == 3]))  # what stays on the screen
     _print_demo_summary(flown, out)
 
 
@@ -100,6 +101,8 @@ def run(
         source, labels or source / "labels.csv", camera=read_camera(camera) if camera else None,
         runway=given, database=runways,
     )  # fmt: skip
+    if not as_json:
+        _compile(scenes=False)
     evaluation, results = _run_folder(folder, out, model, false_alarm_rate, quiet=as_json)
     if as_json:
         _print_json(asdict(evaluation) | {"out": str(out)})
@@ -124,6 +127,8 @@ def audit(
     from shortfinal.stream.source import read_camera
 
     given = read_camera(camera) if camera else None
+    if not as_json:
+        _compile(scenes=False)
     report = audit_file(labels, runways, out, sigma_px=sigma_px, false_alarm_rate=false_alarm_rate, camera=given)
     if as_json:
         _print_json(report_as_dict(report))
@@ -223,7 +228,7 @@ def _run_folder(
     from shortfinal.evaluate import evaluate
     from shortfinal.files import make_folder, write_png, write_whole
     from shortfinal.pipeline import LandingPipeline
-    from shortfinal.stream.overlay import Notes, contact_sheet, draw_result
+    from shortfinal.stream.overlay import contact_sheet, draw_close_up
     from shortfinal.stream.sink import JsonlWriter
 
     detector, target = KeypointDetector(model), make_folder(out)
@@ -241,11 +246,29 @@ def _run_folder(
             truths.append(frame.truth_px)
             distances.append(frame.distance_m)
             if number % every == 0:
-                pictures.append(draw_result(frame.image, result, Notes(f"{frame.name}  {frame.runway.ident}")))
+                pictures.append(
+                    draw_close_up(frame.image, result, f"{frame.runway.ident}  {frame.name}", frame.truth_px)
+                )
     evaluation = evaluate([r for _, r in results], truths, distances)
-    write_png(target / "contact_sheet.png", contact_sheet(pictures, columns=4, width=560))
+    write_png(target / "contact_sheet.png", contact_sheet(pictures, columns=6, width=300))
     write_whole(target / "evaluation.json", json.dumps(asdict(evaluation), indent=1))
     return evaluation, results
+
+
+def _compile(*, scenes: bool) -> None:
+    """Compile the kernels, which takes half a minute the first time, with something to look at."""
+    from shortfinal.data.scene import render
+    from shortfinal.demo import CAMERA, RUNWAY, approach_pose, demo_scene
+    from shortfinal.geometry import PixelWindow, project
+    from shortfinal.keypoints import GaussianKeypoints
+    from shortfinal.pose import estimate_pose
+
+    with console.status("compiling the kernels (once on this machine, about half a minute) ..."):
+        pose = approach_pose(0)
+        corners = project(CAMERA, pose, RUNWAY.corners)
+        estimate_pose(GaussianKeypoints.from_sigma(corners, 1.0), RUNWAY.corners, CAMERA)
+        if scenes:
+            render(demo_scene(), CAMERA.view(PixelWindow(0, 0, 8, 8, 8, 8)), pose)
 
 
 def _sized_runway(size: str, ident: str) -> Any:
@@ -286,23 +309,25 @@ def _table(title: str, columns: tuple[str, ...]) -> Table:
 
 
 def _demo_table(frames: Iterable[Flown]) -> Table:
-    table = _table(
-        "", ("frame", "distance", "height", "left", "err along", "err height", "σ px", "p", "verdict", "fault")
-    )
+    table = _table("", ("frame", "distance m", "height m", "error m", "vertical", "σ px", "p", "verdict", "fault"))
     for f in frames:
         estimate, keypoints = f.result.estimate, f.result.keypoints
-        cells = ["–"] * 5
+        cells = ["–"] * 4
         if estimate is not None and estimate.pose is not None and estimate.cov is not None and f.error_m is not None:
-            x, y, z = estimate.pose.position_m
-            sx, sy, sz = 2 * estimate.cov.diagonal()[:3] ** 0.5
-            cells = [f"{-x:.0f} ± {sx:.0f}", f"{z:.1f} ± {sz:.1f}", f"{y:.1f} ± {sy:.1f}",
-                     f"{f.error_m[0]:+.1f}", f"{f.error_m[2]:+.1f}"]  # fmt: skip
+            x, _, z = estimate.pose.position_m
+            sx, _, sz = 2 * estimate.cov.diagonal()[:3] ** 0.5
+            along, _, vertical = f.error_m
+            cells = [f"{-x:.0f} ±{sx:4.0f}", f"{z:.1f} ±{sz:4.1f}", f"{along:+.1f}", f"{vertical:+.1f}"]
         sigma = "–" if keypoints is None else f"{keypoints.sigma_px.mean():.2f}"
         p, decision = f.result.verdict.p_value, f.result.verdict.decision.value
-        style = _STYLES[decision]
-        table.add_row(str(f.number), *cells, sigma, "–" if p is None else f"{p:.1e}", Text(decision, style=style),
-                      Text(f.fault.value.removeprefix("injected: "), style="yellow"))  # fmt: skip
+        table.add_row(
+            str(f.number), *cells, sigma, "–" if p is None else f"{p:.0e}",
+            Text(decision, style=_STYLES[decision]), Text(_FAULT_WORDS[f.fault.name], style="yellow"),
+        )  # fmt: skip
     return table
+
+
+_FAULT_WORDS = {"NONE": "", "FAR_THRESHOLD": "far 184 m short", "NEAR_CORNER": "corner slid"}
 
 
 def _demo_summary(flown: list[Flown]) -> dict[str, Any]:
@@ -334,7 +359,7 @@ def _print_demo_summary(flown: list[Flown], out: Path) -> None:
         "far_threshold": "far threshold 184 m short",
         "near_corner": "near corner on a taxiway",
     }
-    table = _table("", ("fault", "frames", "used", "refused", "not monitored", "error of used frames: along", "height"))
+    table = _table("", ("fault", "frames", "used", "refused", "not monitored", "along error", "vertical"))
     for name, row in _demo_summary(flown).items():
         error = row["median_used_error_m"]
         cells = ("–", "–") if error is None else (f"{error['along']:.1f} m", f"{error['vertical']:.1f} m")
@@ -342,8 +367,9 @@ def _print_demo_summary(flown: list[Flown], out: Path) -> None:
         table.add_row(titles[name], *counts, *cells)
     console.print(table)
     console.print(
-        "Refused is right for the corner on the taxiway. The misplaced far threshold fits another pose so well that\n"
-        "a single frame often cannot show it: look at the error that then goes unnoticed (docs/integrity.md)."
+        "Errors: medians of the frames used. The corner on the taxiway must be refused. The misplaced far threshold "
+        "fits another pose so well that a single frame often cannot show it: that error goes unnoticed "
+        "(docs/integrity.md)."
     )
     console.print(f"written: {out}/approach.mp4, contact_sheet.png, timeline.png, frames.jsonl")
 

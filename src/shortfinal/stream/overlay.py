@@ -58,7 +58,8 @@ def draw_result(frame: Image, result: FrameResult, notes: Notes) -> Image:
     canvas = np.full((_VIEW[1], _VIEW[0] + _PANEL + _GAP, 3), _PAPER, np.uint8)
     top, left = (_VIEW[1] - size[1]) // 2, (_VIEW[0] - size[0]) // 2
     canvas[top : top + size[1], left : left + size[0]] = view
-    _draw_close_up(canvas, frame, result)
+    if result.crop is not None:
+        canvas[:_PANEL, -_PANEL:] = _seen(frame, result, result.crop, _PANEL)[0]
     return _draw_text(canvas, result, notes)
 
 
@@ -83,6 +84,23 @@ def ellipse(mean: ArrayLike, cov: ArrayLike, sigmas: float, points: int = 48) ->
     return np.asarray(np.asarray(mean, float) + sigmas * (np.linalg.cholesky(np.asarray(cov, float)) @ circle).T)
 
 
+def draw_close_up(
+    frame: Image, result: FrameResult, title: str, truth_px: Array | None = None, size: int = 336
+) -> Image:
+    """The crop the detector saw, magnified to (size, size, 3), framed in the verdict's colour.
+
+    `truth_px` (4, 2): labelled corners, drawn as crosses.
+    """
+    tile = np.full((size, size, 3), _PAPER, np.uint8)
+    if result.crop is not None:
+        tile, window = _seen(frame, result, result.crop, size)
+        for u, v in [] if truth_px is None else window.apply(truth_px):
+            centre = (round(u), round(v))
+            cv2.drawMarker(tile, centre, (255, 80, 255), cv2.MARKER_TILTED_CROSS, 9, 1, cv2.LINE_AA)
+    cv2.rectangle(tile, (0, 0), (size - 1, size - 1), COLOURS[result.verdict.decision], 3)
+    return write_labelled(tile, title)
+
+
 def contact_sheet(pictures: Sequence[Image], columns: int, width: int = 420) -> Image:
     """Pictures of one shape (h, w, 3) side by side, each `width` pixels wide."""
     height = round(pictures[0].shape[0] * width / pictures[0].shape[1])
@@ -96,8 +114,8 @@ def write_labelled(picture: Image, text: str, colour: Colour = _INK, size: int =
     """The picture with a line of text in its top left corner."""
     image = Pillow.fromarray(picture)
     draw = ImageDraw.Draw(image)
-    draw.rectangle(draw.textbbox((4, 3), text, font=_font(size)), fill=_PAPER)
-    draw.text((4, 3), text, fill=colour, font=_font(size))
+    draw.rectangle(draw.textbbox((6, 5), text, font=_font(size)), fill=_PAPER)
+    draw.text((6, 5), text, fill=colour, font=_font(size))
     return np.asarray(image, np.uint8)
 
 
@@ -105,15 +123,12 @@ def _scaled(cov: Array, window: PixelWindow) -> Array:
     return cov * np.outer(window.scale, window.scale)
 
 
-def _draw_close_up(canvas: Image, frame: Image, result: FrameResult) -> None:
-    """The crop the detector saw, magnified."""
-    if result.crop is None:
-        return
-    crop = result.crop
-    window = PixelWindow(crop.left, crop.top, crop.width, crop.height, _PANEL, _PANEL)
+def _seen(frame: Image, result: FrameResult, crop: PixelWindow, size: int) -> tuple[Image, PixelWindow]:
+    """The crop magnified, with the keypoints drawn, and its window."""
+    window = PixelWindow(crop.left, crop.top, crop.width, crop.height, size, size)
     view = crop_image(frame, window)
     draw_keypoints(view, result, window)
-    canvas[: view.shape[0], -_PANEL:] = view
+    return view, window
 
 
 def _draw_text(canvas: Image, result: FrameResult, notes: Notes) -> Image:
