@@ -29,7 +29,7 @@ def test_one_frame_in_keypoints_pose_and_verdict_out(pipeline, frame):
     assert result.timestamp_s == 12.5
     error = result.estimate.pose.minus(TRUTH)
     assert error @ np.linalg.inv(result.estimate.cov) @ error < 22.5  # χ²(6) at 0.1 %
-    assert set(result.timings_ms) == {"detect", "solve", "doubt"}
+    assert set(result.timings) == {"detect_ms", "solve_ms", "doubt_ms"}
 
 
 def test_a_prior_pose_is_as_good_as_a_box(pipeline, frame):

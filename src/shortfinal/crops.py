@@ -29,7 +29,7 @@ def centre_crop(box: ArrayLike, margin: float, size: int) -> PixelWindow:
 def bogo_crop(box: ArrayLike, margin: float, size: int, rng: np.random.Generator, slack: float = 0.0) -> PixelWindow:
     """A square window of the same size, placed uniformly among all that contain the box.
 
-    The paper draws crops until one contains the runway (its "bogo" crop, section 4.1); given that it
+    The paper draws crops until one contains the runway (its "bogo" crop); given that it
     does, the crop is uniform over the positions that do, and those form a rectangle: so it is
     sampled there directly. `slack` keeps the box that fraction of the side away from the borders.
     """

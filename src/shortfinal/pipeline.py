@@ -33,7 +33,7 @@ class FrameResult:
     keypoints: GaussianKeypoints | None  # in the frame's pixels
     estimate: PoseEstimate | None
     verdict: IntegrityVerdict
-    timings_ms: dict[str, float] = field(default_factory=dict)  # stage -> duration
+    timings: dict[str, float] = field(default_factory=dict)  # "detect_ms", "solve_ms", "doubt_ms"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON. Lengths in metres, angles in degrees, pixels of the frame."""
@@ -44,7 +44,7 @@ class FrameResult:
             "statistic": self.verdict.statistic,
             "dof": self.verdict.dof,
             "p_value": self.verdict.p_value,
-            "timings_ms": {stage: round(ms, 3) for stage, ms in self.timings_ms.items()},
+            "timings": {stage: round(ms, 3) for stage, ms in self.timings.items()},
         }
         if self.crop is not None:
             record["crop"] = [self.crop.left, self.crop.top, self.crop.width, self.crop.height]
@@ -104,7 +104,7 @@ class LandingPipeline:
         try:
             crop = self._crop(box, prior)
             with_crop = crop
-            keypoints = _timed(timings, "detect", lambda: self.detector.detect(frame_rgb, with_crop))
+            keypoints = _timed(timings, "detect_ms", lambda: self.detector.detect(frame_rgb, with_crop))
             keypoints = alter(keypoints) if alter else keypoints
         except InputError as error:
             verdict = IntegrityVerdict(Decision.NOT_MONITORED, (str(error),), 0, self.false_alarm_rate)
@@ -117,8 +117,8 @@ class LandingPipeline:
     ) -> tuple[PoseEstimate, IntegrityVerdict]:
         """Solve and doubt: from keypoints in the frame's pixels, whoever found them."""
         timings = {} if timings is None else timings
-        estimate = _timed(timings, "solve", lambda: estimate_pose(keypoints, self.runway.corners, self.camera))
-        verdict = _timed(timings, "doubt", lambda: check_integrity(estimate, self.false_alarm_rate))
+        estimate = _timed(timings, "solve_ms", lambda: estimate_pose(keypoints, self.runway.corners, self.camera))
+        verdict = _timed(timings, "doubt_ms", lambda: check_integrity(estimate, self.false_alarm_rate))
         if verdict.decision is Decision.USE:
             self._last = estimate.pose
         return estimate, verdict

@@ -1,6 +1,6 @@
 """The network: backbone, one 1x1 convolution, spatial soft argmax; and its Gaussian likelihood.
 
-Valentin et al. 2025 (arXiv 2508.09732), sections 3.1 and 3.2. Where this departs: docs/paper.md.
+Valentin et al. 2025 (arXiv 2508.09732). Where this departs from it: docs/paper.md.
 """
 
 from __future__ import annotations

@@ -1,0 +1,10 @@
+import runpy
+from pathlib import Path
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def test_solve_and_doubt(capsys):
+    runpy.run_path(str(EXAMPLES / "solve_and_doubt.py"))
+    out = capsys.readouterr().out
+    assert out.index(" USE: ") < out.index("DO_NOT_USE: ")
