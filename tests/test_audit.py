@@ -313,7 +313,7 @@ def test_files_that_cannot_be_used_are_refused(tmp_path):
     px = labels_with(whole_pixels, 1)[0].corners_px
     path, runways = write(tmp_path / "labels.csv", [v2_row(px)]), tmp_path / "runways.json"
     runways.write_text(json.dumps(DATABASE))
-    with pytest.raises(sf.InputError, match=r"labels\.csv: line 2: .*give the camera"):
+    with pytest.raises(sf.InputError, match=r"labels\.csv: line 2: .*pass --camera"):
         audit_file(path, runways, tmp_path / "out")
     with pytest.raises(sf.InputError, match=r"missing\.json"):
         audit_file(path, tmp_path / "missing.json", tmp_path / "out", camera=EARTH_STUDIO)

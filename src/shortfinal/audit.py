@@ -159,7 +159,7 @@ def audit_file(
     """
     labels = read_labels(labels_csv, camera)
     if all(label.camera is None for label in labels):
-        raise InputError(f"{labels_csv}: line 2: the file does not say which camera took the images; give the camera")
+        raise InputError(f"{labels_csv}: line 2: the file does not say which camera took the images; pass --camera")
     report = audit_labels(
         labels,
         load_database(runways_json),
@@ -399,21 +399,15 @@ def _worst_table(shown: Sequence[AuditedLabel]) -> RenderableType:
     from rich.text import Text
 
     table = Table(box=None, pad_edge=False)
-    for name in ("line", "image", "runway", "findings", "p", "χ²", "px", "distance", "recorded"):
-        table.add_column(name, justify="left" if name in ("image", "runway", "findings") else "right", overflow="fold")
+    for name in ("line", "image", "runway", "χ²", "solved m", "recorded", "findings"):
+        words = name in ("image", "runway", "findings")
+        table.add_column(name, justify="left" if words else "right", no_wrap=name != "findings")
     for a in shown:
-        findings = " ".join(f.value for f in a.findings) or a.verdict
-        numbers = (
-            _number(value, form)
-            for value, form in (
-                (a.p_value, ".1e"),
-                (a.statistic, ".1f"),
-                (a.reprojection_px, ".2f"),
-                (a.distance_m, ".0f"),
-                (a.label.distance_m, ".0f"),
-            )
-        )
-        cells = (str(a.label.line), Path(a.label.image).name, a.label.ident, findings, *numbers)
+        findings = ", ".join(f.value for f in a.findings) or f"{a.verdict}: {a.note:.60}"
+        numbers = (_number(a.statistic, ".3g"), _number(a.distance_m, ".0f"), _number(a.label.distance_m, ".0f"))
+        name = Path(a.label.image).name
+        name = name if len(name) <= 22 else f"{name[:10]}…{name[-11:]}"
+        cells = (str(a.label.line), name, a.label.ident, *numbers, findings)
         table.add_row(*map(Text, cells))  # as Text, for a name may hold what rich takes for markup
     return table
 
@@ -425,6 +419,8 @@ def _number(value: float | None, form: str) -> str:
 def _limits(report: AuditReport) -> RenderableType:
     from rich.text import Text
 
+    if not any(a.verdict == "passed" for a in report.labels):
+        return Text("No label passed, so there is nothing to say of what could not be seen.")
     sigmas = sorted({report.sigma_px or a.label.rounding_sigma_px for a in report.labels})
     lines = [
         f"Held against sigma {', '.join(f'{s:.3g}' for s in sigmas)} px, "
