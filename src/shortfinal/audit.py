@@ -403,7 +403,7 @@ def _worst_table(shown: Sequence[AuditedLabel]) -> RenderableType:
         words = name in ("image", "runway", "findings")
         table.add_column(name, justify="left" if words else "right", no_wrap=name != "findings")
     for a in shown:
-        findings = ", ".join(f.value for f in a.findings) or f"{a.verdict}: {a.note:.60}"
+        findings = " ".join(f.value for f in a.findings) or a.note.partition(";")[0].removeprefix("database: ")
         numbers = (_number(a.statistic, ".3g"), _number(a.distance_m, ".0f"), _number(a.label.distance_m, ".0f"))
         name = Path(a.label.image).name
         name = name if len(name) <= 22 else f"{name[:10]}…{name[-11:]}"
