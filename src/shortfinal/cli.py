@@ -300,11 +300,10 @@ def _print_json(record: dict[str, Any]) -> None:
 
 
 def _table(title: str, columns: tuple[str, ...]) -> Table:
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    table = Table(title=title or None, title_justify="left", box=None, pad_edge=False)
     for name in columns:
-        table.add_column(
-            name, justify="right" if name not in ("fault", "verdict", "why", "corners", "image") else "left"
-        )
+        words = name in ("fault", "verdict", "why", "corners", "image")
+        table.add_column(name, justify="left" if words else "right", no_wrap=name != "why")
     return table
 
 
@@ -317,7 +316,7 @@ def _demo_table(frames: Iterable[Flown]) -> Table:
             x, _, z = estimate.pose.position_m
             sx, _, sz = 2 * estimate.cov.diagonal()[:3] ** 0.5
             along, _, vertical = f.error_m
-            cells = [f"{-x:.0f} ±{sx:.0f}", f"{z:.1f} ±{sz:.1f}", f"{along:+.1f}", f"{vertical:+.1f}"]
+            cells = [f"{-x:.0f} ±{sx:.0f}", f"{z:.0f} ±{sz:.1f}", f"{along:+.1f}", f"{vertical:+.1f}"]
         sigma = "–" if keypoints is None else f"{keypoints.sigma_px.mean():.2f}"
         p, decision = f.result.verdict.p_value, f.result.verdict.decision.value
         table.add_row(
@@ -331,45 +330,46 @@ _FAULT_WORDS = {"NONE": "", "FAR_THRESHOLD": "far short", "NEAR_CORNER": "corner
 
 
 def _demo_summary(flown: list[Flown]) -> dict[str, Any]:
+    """Per fault: frames, decisions, and medians of the error and of what the fault did to the pose."""
     from shortfinal.demo import Fault
     from shortfinal.integrity import Decision
 
     summary: dict[str, Any] = {}
     for fault in Fault:
         mine = [f for f in flown if f.fault is fault]
-        used = [f.error_m for f in mine if f.result.verdict.decision is Decision.USE and f.error_m is not None]
         summary[fault.name.lower()] = {
             "frames": len(mine),
             **{d.value: sum(f.result.verdict.decision is d for f in mine) for d in Decision},
-            "median_used_error_m": _medians(used),
+            "median_abs_error_m": _medians([f.error_m for f in mine], absolute=True),
+            "median_moved_by_fault_m": _medians([f.moved_m for f in mine], absolute=False),
         }
     return summary
 
 
-def _medians(errors: list[Any]) -> dict[str, float] | None:
+def _medians(values: list[Any], *, absolute: bool) -> dict[str, float] | None:
     from statistics import median
 
+    known = [v for v in values if v is not None]
     names = ("along", "cross", "vertical")
-    return {n: round(median(abs(float(e[i])) for e in errors), 2) for i, n in enumerate(names)} if errors else None
+    pick = abs if absolute else float
+    return {n: round(median(pick(float(v[i])) for v in known), 2) for i, n in enumerate(names)} if known else None
 
 
 def _print_demo_summary(flown: list[Flown], out: Path) -> None:
-    titles = {
-        "none": "no fault",
-        "far_threshold": "far threshold 184 m short",
-        "near_corner": "near corner on a taxiway",
-    }
-    table = _table("", ("fault", "frames", "used", "refused", "not monitored", "along error", "vertical"))
+    titles = {"none": "none", "far_threshold": "far 184 m short", "near_corner": "near corner slid"}
+    table = _table("", ("fault", "frames", "used", "refused", "error along", "up", "moved along", "up"))
     for name, row in _demo_summary(flown).items():
-        error = row["median_used_error_m"]
-        cells = ("–", "–") if error is None else (f"{error['along']:.1f} m", f"{error['vertical']:.1f} m")
-        counts = (str(row[k]) for k in ("frames", "use", "do-not-use", "not-monitored"))
+        counts = [str(row[k]) for k in ("frames", "use", "do-not-use")]
+        cells = []
+        for key in ("median_abs_error_m", "median_moved_by_fault_m"):
+            medians = row[key]
+            blank = medians is None or (name == "none" and "moved" in key)
+            cells += ["–", "–"] if blank else [f"{medians['along']:.1f}", f"{medians['vertical']:.1f}"]
         table.add_row(titles[name], *counts, *cells)
     console.print(table)
     console.print(
-        "Errors: medians of the frames used. The corner on the taxiway must be refused. The misplaced far threshold "
-        "fits another pose so well that a single frame often cannot show it: that error goes unnoticed "
-        "(docs/integrity.md)."
+        "Medians of all frames, in metres; moved: what the fault did to the pose. The slid corner must be refused. "
+        "The misplaced far threshold fits another pose so well that one frame often cannot show it (docs/integrity.md)."
     )
     console.print(f"written: {out}/approach.mp4, contact_sheet.png, timeline.png, frames.jsonl")
 

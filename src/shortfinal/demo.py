@@ -19,6 +19,7 @@ from shortfinal.geometry import Camera, Pose, project
 from shortfinal.integrity import Decision
 from shortfinal.keypoints import GaussianKeypoints
 from shortfinal.pipeline import FrameResult, LandingPipeline
+from shortfinal.pose import PoseEstimate, estimate_pose
 from shortfinal.runway import Runway
 from shortfinal.stream.overlay import Notes, contact_sheet, draw_result
 from shortfinal.stream.sink import JsonlWriter, VideoWriter
@@ -27,7 +28,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 CAMERA = Camera(960, 720, 2000.0, 2000.0, 479.5, 359.5)
-RUNWAY = Runway(2000.0, 45.0, "DEMO/09")
+RUNWAY = Runway(1500.0, 45.0, "DEMO/09")
 FRAMES = 100
 SPEED_M_S = 70.0
 START_M, END_M = 3000.0, 140.0  # distance to the threshold
@@ -47,9 +48,9 @@ class Fault(Enum):
 
 def fault_at(frame: int) -> Fault:
     """The fault of a frame: the far threshold early on, where one frame can't show it; then a corner."""
-    if 24 <= frame < 38:
+    if 20 <= frame < 34:
         return Fault.FAR_THRESHOLD
-    return Fault.NEAR_CORNER if 60 <= frame < 70 else Fault.NONE
+    return Fault.NEAR_CORNER if 46 <= frame < 56 else Fault.NONE
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +61,21 @@ class Flown:
     fault: Fault
     truth: Pose
     result: FrameResult
+    sound: PoseEstimate | None  # from the same frame's keypoints without the fault
 
     @property
     def error_m(self) -> Array | None:
         """Estimated minus true position (3,), m; None without an estimate."""
         estimate = self.result.estimate
         return None if estimate is None or estimate.pose is None else estimate.pose.position_m - self.truth.position_m
+
+    @property
+    def moved_m(self) -> Array | None:
+        """What the fault did to the position (3,), m: with it minus without it."""
+        estimate = self.result.estimate
+        if estimate is None or estimate.pose is None or self.sound is None or self.sound.pose is None:
+            return None
+        return estimate.pose.position_m - self.sound.pose.position_m
 
 
 def approach_pose(frame: int) -> Pose:
@@ -97,10 +107,10 @@ def render_frame(scene: Scene, frame: int) -> Image:
     return render(scene, CAMERA, approach_pose(frame), Sensor(0.5, 2.0, 92), samples=3, seed=frame)
 
 
-def inject(fault: Fault, truth: Pose) -> Callable[[GaussianKeypoints], GaussianKeypoints] | None:
+def inject(fault: Fault, truth: Pose) -> Callable[[GaussianKeypoints], GaussianKeypoints]:
     """What the fault does to the keypoints: the means move to where the wrong thing is seen."""
     if fault is Fault.NONE:
-        return None
+        return lambda keypoints: keypoints
     wrong = RUNWAY.corners.copy()
     if fault is Fault.FAR_THRESHOLD:
         wrong[2:, 0] -= SHORT_M
@@ -108,6 +118,18 @@ def inject(fault: Fault, truth: Pose) -> Callable[[GaussianKeypoints], GaussianK
         wrong[1] = _TAXIWAY_EDGE_M
     shift = project(CAMERA, truth, wrong) - project(CAMERA, truth, RUNWAY.corners)
     return lambda keypoints: GaussianKeypoints(keypoints.mean_px + shift, keypoints.cov_px)
+
+
+def _spoil(
+    fault: Fault, truth: Pose, found: list[GaussianKeypoints]
+) -> Callable[[GaussianKeypoints], GaussianKeypoints]:
+    """The fault, keeping in `found` the keypoints as they were."""
+
+    def spoil(keypoints: GaussianKeypoints) -> GaussianKeypoints:
+        found.append(keypoints)
+        return inject(fault, truth)(keypoints)
+
+    return spoil
 
 
 def fly(detector: KeypointDetector) -> Iterator[tuple[Flown, Image]]:
@@ -126,8 +148,10 @@ def fly(detector: KeypointDetector) -> Iterator[tuple[Flown, Image]]:
             ahead[number] = Future()  # let go of the picture
             prior = truth.plus(rng.normal(0, [8, 4, 4, 0.003, 0.003, 0.003]))
             timestamp = number / (FRAMES - 1) * (START_M - END_M) / SPEED_M_S
-            result = pipeline.step(image, timestamp, prior=prior, alter=inject(fault, truth))
-            yield Flown(number, fault, truth, result), image
+            found: list[GaussianKeypoints] = []
+            result = pipeline.step(image, timestamp, prior=prior, alter=_spoil(fault, truth, found))
+            sound = estimate_pose(found[0], RUNWAY.corners, CAMERA) if found else None
+            yield Flown(number, fault, truth, result, sound), image
 
 
 def run_demo(
@@ -157,11 +181,12 @@ def run_demo(
     return flown
 
 
-_SHOWN = (0, 12, 22, 30, 45, 58, 63, 66, 72, 82, 92, 99)
+_SHOWN = (0, 12, 22, 30, 40, 48, 53, 62, 72, 82, 92, 99)
 
 
 def _record(frame: Flown) -> dict[str, object]:
     record: dict[str, object] = {"frame": frame.number, "fault": frame.fault.name, **frame.result.to_dict()}
+    record["moved_by_fault_m"] = None if frame.moved_m is None else frame.moved_m.tolist()
     record["true_position_m"] = frame.truth.position_m.tolist()
     record["true_attitude_deg"] = list(frame.truth.attitude)
     return record
