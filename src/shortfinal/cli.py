@@ -75,6 +75,7 @@ def demo(out: Out = Path("results/demo"), model: Model = None, as_json: Json = F
 
         flown = run_demo(out, seen, model)
         live.update(_demo_table([f for f in flown if f.number % 7 == 3]))  # what stays on the screen
+    console.print()
     _print_demo_summary(flown, out)
 
 

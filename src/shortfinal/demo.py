@@ -90,16 +90,15 @@ def approach_pose(frame: int) -> Pose:
 
 
 def demo_scene() -> Scene:
-    """The embedded airfield: a seeded scene with a taxiway at the landing threshold."""
+    """The embedded airfield: a seeded scene, its runway of weathered asphalt, a taxiway at the threshold."""
     scene = random_scene(np.random.default_rng(_SEED), RUNWAY)
+    surface, grey = np.array([0.40, 0.40, 0.41]), np.array([0.47, 0.47, 0.46])
     strips = scene.strips.copy()
-    grey = scene.surface * 0.92
-    strips[0] = [8.0, 0.0, 8.0, -150.0, 9.0, *grey]
-    strips[1] = [-60.0, -150.0, RUNWAY.length_m + 60, -150.0, 11.0, *grey]
-    return scene._replace(
-        strips=strips,
-        pad=np.array([[60.0, *(scene.surface * 0.85), 2.0, 0.0], [60.0, *(scene.surface * 0.85), 2.0, 0.0]]),
-    )
+    strips[:, 5:] = grey
+    strips[0, :5] = [8.0, 0.0, 8.0, -150.0, 9.0]
+    strips[1, :5] = [-60.0, -150.0, RUNWAY.length_m + 60, -150.0, 11.0]
+    pad = np.array([[60.0, *(0.9 * surface), 2.0, 0.0]] * 2)
+    return scene._replace(surface=surface, shoulder=0.9 * surface, wear=0.15, strips=strips, pad=pad)
 
 
 def render_frame(scene: Scene, frame: int) -> Image:
@@ -213,7 +212,7 @@ def _draw_timeline(flown: list[Flown], path: Path) -> None:
             mine = np.array([f.result.verdict.decision is decision for f in flown])
             ax.plot(distance[mine], error[mine, axis], ".", color=colour, label=decision.value)
         ax.set_ylabel(f"{name} error (m)")
-        ax.set_yscale("symlog", linthresh=2 * float(np.nanmedian(sigma[:, axis])))
+        ax.set_yscale("symlog", linthresh=(100, 10, 10)[axis])
         ax.axhline(0, color="k", lw=0.5)
     axes[0].legend(ncol=4, fontsize=8, loc="lower left")
     p = np.array([f.result.verdict.p_value if f.result.verdict.p_value is not None else np.nan for f in flown])
