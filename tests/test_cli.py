@@ -16,7 +16,7 @@ CORNERS = sf.project(CAMERA, approach_pose(60), RUNWAY.corners)
 CAMERA_FIELDS = {"width": 960, "height": 720, "fx": CAMERA.fx, "fy": CAMERA.fy, "cx": CAMERA.cx, "cy": CAMERA.cy}
 PROBLEM = {
     "camera": CAMERA_FIELDS,
-    "runway": {"length_m": 2000.0, "width_m": 45.0},
+    "runway": {"length_m": RUNWAY.length_m, "width_m": RUNWAY.width_m},
     "keypoints_px": CORNERS.tolist(),
     "sigma_px": 0.5,
 }
@@ -58,7 +58,7 @@ def folder(tmp_path):
 
 
 def run_arguments(folder):
-    return ("run", folder, "--camera", folder / "camera.toml", "--size", "2000x45", "--out", folder / "out")
+    return ("run", folder, "--camera", folder / "camera.toml", "--size", "1500x45", "--out", folder / "out")
 
 
 def problem_file(tmp_path, **changes):
