@@ -144,7 +144,7 @@ def test_the_shipped_model_finds_the_corners_of_scenes_it_never_saw():
     from shortfinal.data.dataset import plan_shot
 
     detector, errors, sigmas = sf.KeypointDetector(), [], []
-    for index in range(40):
+    for index in range(80):
         example = plan_shot(987654, index).render()
         box = np.concatenate([example.corners_px.min(axis=0), example.corners_px.max(axis=0)])
         window = centre_crop(box, detector.info.margin, detector.info.size)
@@ -152,8 +152,11 @@ def test_the_shipped_model_finds_the_corners_of_scenes_it_never_saw():
         errors.append((window.apply(found.mean_px) - window.apply(example.corners_px)).ravel())
         sigmas.append((found.sigma_px * window.scale).ravel())
     errors, sigmas = np.abs(errors), np.array(sigmas)
-    assert np.median(errors) < 2.0  # px of the 224 px crop
-    assert 0.5 < np.mean(errors < sigmas) < 0.85  # 68 % if the sigmas are right
+    # The file's own figures, of 500 scenes, hold here: 80 scenes leave the median some 20 % of play,
+    # and the share within sigma some 5 points, since the eight coordinates of a scene err together.
+    figures = detector.info.figures
+    assert np.median(errors) < 1.4 * figures["median_px"]
+    assert np.mean(errors < sigmas) == pytest.approx(figures["coverage_68"], abs=0.12)
 
 
 def test_rgb_not_bgr():

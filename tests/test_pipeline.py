@@ -39,6 +39,31 @@ def test_a_prior_pose_is_as_good_as_a_box(pipeline, frame):
     assert np.abs(shift / one.keypoints.sigma_px).max() < 3
 
 
+def test_a_crop_that_cuts_the_runway_off_is_moved(pipeline, frame):
+    # A third of the runway's box aside: the first crop misses a corner, which the network places
+    # inside all the same. Looking again where it was found brings it in.
+    shift = (BOX[2] - BOX[0]) * np.array([0.35, 0.0, 0.35, 0.0])
+    result = pipeline.step(frame, box=BOX + shift)
+    assert result.verdict.decision is Decision.USE
+    error = result.estimate.pose.minus(TRUTH)
+    assert error @ np.linalg.inv(result.estimate.cov) @ error < 22.5
+    inside = result.crop.apply(sf.project(CAMERA, TRUTH, RUNWAY.corners))
+    assert (inside > 10).all()
+    assert (inside < 213).all()
+
+
+def test_a_corner_beyond_the_frame_is_not_measured(pipeline):
+    # The same picture cut off left of the runway's middle: two corners are not in it.
+    full = render_frame(demo_scene(), 80)
+    middle = int((BOX[0] + BOX[2]) / 2)
+    cut = sf.Camera(CAMERA.width - middle, CAMERA.height, CAMERA.fx, CAMERA.fy, CAMERA.cx - middle, CAMERA.cy)
+    half = sf.LandingPipeline(pipeline.detector, RUNWAY, cut)
+    result = half.step(np.ascontiguousarray(full[:, middle:]), box=BOX - [middle, 0, middle, 0])
+    assert result.verdict.decision is Decision.NOT_MONITORED
+    assert result.estimate is None
+    assert "border of the frame" in result.verdict.reasons[0] or "does not settle" in result.verdict.reasons[0]
+
+
 def test_without_a_box_it_looks_where_the_last_accepted_frame_was(frame):
     fresh = sf.LandingPipeline(sf.KeypointDetector(), RUNWAY, CAMERA)
     lost = fresh.step(frame)

@@ -14,14 +14,17 @@ from numpy.typing import ArrayLike, NDArray
 from shortfinal.crops import box_around, centre_crop
 from shortfinal.detector import Image, KeypointDetector, check_image
 from shortfinal.errors import InputError
-from shortfinal.geometry import Camera, PixelWindow, Pose, project
+from shortfinal.geometry import Camera, PixelWindow, Pose, as_array, project
 from shortfinal.integrity import Decision, IntegrityVerdict, check_integrity
-from shortfinal.keypoints import GaussianKeypoints
+from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
 from shortfinal.pose import PoseEstimate, estimate_pose
 from shortfinal.runway import Runway
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
+
+WIDE_MARGIN = 1.9  # of the first crop around a prior pose: the widest that training uses
+LOOKS = 3  # crops at most, for a frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +88,8 @@ class LandingPipeline:
     ) -> FrameResult:
         """Process one frame (height, width, 3; RGB, uint8).
 
-        `box` (4,): left, top, right, bottom in pixels; `prior`: a pose near enough to see the runway
-        within the crop's margin. `alter` changes the keypoints before they are used: for injecting
+        `box` (4,): left, top, right, bottom in pixels; `prior`: a pose near enough for a crop
+        twice the runway's size to see most of it. `alter` changes the keypoints before they are used: for injecting
         faults. Raises InputError for a frame of another size or type or a timestamp that is not
         finite; whatever fails after that is a verdict of NOT_MONITORED with its reason.
         """
@@ -99,16 +102,13 @@ class LandingPipeline:
         if not math.isfinite(timestamp_s):
             raise InputError(f"timestamp_s: {timestamp_s}; it must be finite")
         timings: dict[str, float] = {}
-        crop: PixelWindow | None = None
-        keypoints: GaussianKeypoints | None = None
         try:
-            crop = self._crop(box, prior)
-            with_crop = crop
-            keypoints = _timed(timings, "detect_ms", lambda: self.detector.detect(frame_rgb, with_crop))
-            keypoints = alter(keypoints) if alter else keypoints
+            crop, keypoints, obstacle = _timed(timings, "detect_ms", lambda: self._look(frame_rgb, box, prior))
         except InputError as error:
-            verdict = IntegrityVerdict(Decision.NOT_MONITORED, (str(error),), 0, self.false_alarm_rate)
-            return FrameResult(timestamp_s, crop, keypoints, None, verdict, timings)
+            return FrameResult(timestamp_s, None, None, None, self._not_monitored(str(error)), timings)
+        if obstacle:
+            return FrameResult(timestamp_s, crop, keypoints, None, self._not_monitored(obstacle), timings)
+        keypoints = alter(keypoints) if alter else keypoints
         estimate, verdict = self.judge(keypoints, timings)
         return FrameResult(timestamp_s, crop, keypoints, estimate, verdict, timings)
 
@@ -123,19 +123,57 @@ class LandingPipeline:
             self._last = estimate.pose
         return estimate, verdict
 
-    def _crop(self, box: ArrayLike | None, prior: Pose | None) -> PixelWindow:
+    def _not_monitored(self, reason: str) -> IntegrityVerdict:
+        return IntegrityVerdict(Decision.NOT_MONITORED, (reason,), 0, self.false_alarm_rate)
+
+    def _look(
+        self, frame: Image, box: ArrayLike | None, prior: Pose | None
+    ) -> tuple[PixelWindow, GaussianKeypoints, str]:
+        """Crop and detect; again where the runway was found, until the crop frames it; what is in the way, or "".
+
+        A network must name four corners, even of a runway that the crop cuts off, and it does so with
+        confidence. So what was found counts only if it lies well inside what was looked at.
+        """
+        margin, size = self.detector.info.margin, self.detector.info.size
+        wide = margin if box is not None else WIDE_MARGIN
+        window = centre_crop(self._first_box(box, prior), wide, size)
+        keypoints = self.detector.detect(frame, window)
+        for _ in range(LOOKS - 1):
+            if _frames(window, keypoints, margin):
+                break
+            window = centre_crop(box_around(keypoints.mean_px), margin, size)
+            keypoints = self.detector.detect(frame, window)
+        if not _frames(window, keypoints, margin):
+            return window, keypoints, f"the runway does not settle inside the crop in {LOOKS} looks"
+        return window, keypoints, self._cut_off(keypoints)
+
+    def _first_box(self, box: ArrayLike | None, prior: Pose | None) -> Array:
         if box is None:
             near = prior or self._last
             if near is None:
                 raise InputError("where to look is not known: no box, no prior pose, and no earlier frame was accepted")
             box = box_around(project(self.camera, near, self.runway.corners))
-        bounds = np.asarray(box, float)
-        outside = bounds.shape == (4,) and (
-            (bounds[2:] < 0).any() or bounds[0] >= self.camera.width or bounds[1] >= self.camera.height
-        )
-        if outside:
+        bounds = as_array(box, (4,), "box")
+        if (bounds[2:] < 0).any() or bounds[0] >= self.camera.width or bounds[1] >= self.camera.height:
             raise InputError(f"the runway's box {np.round(bounds).tolist()} lies outside the frame")
-        return centre_crop(bounds, self.detector.info.margin, self.detector.info.size)
+        return bounds
+
+    def _cut_off(self, keypoints: GaussianKeypoints) -> str:
+        """Which corner is at the frame's border, to within 2 sigma: it may lie beyond, unseen."""
+        reach = 2 * keypoints.sigma_px
+        last = np.array([self.camera.width - 1, self.camera.height - 1])
+        outside = ((keypoints.mean_px < reach) | (keypoints.mean_px > last - reach)).any(axis=1)
+        if not outside.any():
+            return ""
+        return f"the {CORNER_NAMES[int(outside.argmax())]} corner lies at the border of the frame, or beyond it"
+
+
+def _frames(window: PixelWindow, keypoints: GaussianKeypoints, margin: float) -> bool:
+    """Whether the crop has the runway inside, with half the intended border, and not much too small."""
+    inside = window.apply(keypoints.mean_px) / (window.out_width - 1)
+    border = (1 - 1 / margin) / 4
+    extent = float(np.ptp(inside, axis=0).max())
+    return bool((inside > border).all() and (inside < 1 - border).all() and extent > 0.8 / margin)
 
 
 def _timed(timings: dict[str, float], stage: str, work: Callable[[], T]) -> T:
