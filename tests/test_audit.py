@@ -209,7 +209,7 @@ def test_what_could_not_be_checked_never_passes():
     assert {a.verdict for a in report.not_checked} == {"not checked"}
     assert report.expected_false_alarms == pytest.approx(8e-3)
     notes = sorted(a.note for a in report.not_checked)
-    assert notes[0] == "camera unknown"
+    assert notes[0] == "camera unknown: pass --camera"
     assert "unknown runway 'TEST/19'" in notes[1]
     assert "nearest: TEST/01" in notes[1]
 
@@ -218,6 +218,7 @@ def test_nothing_checked_is_told_as_such():
     report = audit_labels([replace(label, ident="XXXX/09") for label in labels_with(whole_pixels, 5)], DATABASE)
     text = screen(report)
     assert "5 could not be checked" in text
+    assert "0 passed, 5 not checked" in text
     assert np.isnan(report.sigma_ratio)
     assert report_as_dict(report)["shift_missed"] is None
     assert "passed" not in {row["verdict"] for row in report_as_dict(report)["rows"]}
@@ -309,12 +310,23 @@ def test_options_out_of_range_are_refused(options, words):
         audit_labels(labels_with(whole_pixels, 1), DATABASE, **options)
 
 
+def test_labels_without_a_camera_are_listed_as_not_checked(tmp_path):
+    path = write(tmp_path / "labels.csv", [v2_row(label.corners_px) for label in labels_with(whole_pixels, 2)])
+    (tmp_path / "runways.json").write_text(json.dumps(DATABASE))
+    report = audit_file(path, tmp_path / "runways.json", tmp_path / "out")
+    assert [a.note for a in report.not_checked] == ["camera unknown: pass --camera"] * 2
+    assert "0 of 2 labels contradict the runway, 0 passed, 2 not checked" in screen(report)
+
+
+def test_a_tiny_rate_has_a_finite_tolerance():
+    (audited,) = audit_labels(labels_with(whole_pixels, 1), DATABASE, false_alarm_rate=1e-18).labels
+    assert np.isfinite(audited.distance_tolerance_m)
+
+
 def test_files_that_cannot_be_used_are_refused(tmp_path):
     px = labels_with(whole_pixels, 1)[0].corners_px
     path, runways = write(tmp_path / "labels.csv", [v2_row(px)]), tmp_path / "runways.json"
     runways.write_text(json.dumps(DATABASE))
-    with pytest.raises(sf.InputError, match=r"labels\.csv: line 2: .*pass --camera"):
-        audit_file(path, runways, tmp_path / "out")
     with pytest.raises(sf.InputError, match=r"missing\.json"):
         audit_file(path, tmp_path / "missing.json", tmp_path / "out", camera=EARTH_STUDIO)
     with pytest.raises(sf.InputError, match=r"labels\.csv: cannot make the output folder"):

@@ -60,6 +60,8 @@ def test_the_fitted_scale_mends_each_coordinate():
         ([np.nan], [1.0], "finite"),
         (np.ones((2, 2)), np.ones((2, 3, 3)), "expected covariances"),
         (np.ones((2, 2)), np.zeros((2, 2, 2)), "positive definite"),
+        (np.ones((1, 2)), [[[1.0, np.nan], [np.nan, 1.0]]], "finite"),
+        (np.ones((1, 2)), [[[1.0, 0.5], [0.0, 1.0]]], "not symmetric"),
     ],
 )
 def test_wrong_input_is_refused(errors, sigma, message):

@@ -1,10 +1,13 @@
 import csv
+import shutil
 
+import cv2
 import numpy as np
 import pytest
 
 import shortfinal as sf
-from shortfinal.data.dataset import plan_shot, read_dataset, write_dataset
+from shortfinal.data.dataset import plan_shot, read_dataset, read_image, write_dataset
+from shortfinal.files import write_whole
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +75,53 @@ def test_damaged_labels_are_named(folder, tmp_path, damage, message):
 def test_a_missing_or_broken_picture_is_named(folder, tmp_path):
     (tmp_path / "labels.csv").write_text((folder / "labels.csv").read_text())
     with pytest.raises(sf.InputError, match=r"000000\.png: no such image"):
-        read_dataset(tmp_path)[0]
-    (tmp_path / "images").mkdir()
+        read_dataset(tmp_path)
+    shutil.copytree(folder / "images", tmp_path / "images")
     (tmp_path / "images" / "000000.png").write_bytes(b"not a picture")
     with pytest.raises(sf.InputError, match=r"000000\.png: cannot be read"):
         read_dataset(tmp_path)[0]
     with pytest.raises(sf.InputError, match="cannot read the labels"):
         read_dataset(tmp_path / "nowhere")
+
+
+def test_a_jpeg_that_is_cut_off_is_refused(tmp_path):
+    content = bytes(cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8))[1])
+    path = tmp_path / "a.jpg"
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(sf.InputError, match=r"a\.jpg: truncated JPEG"):
+        read_image(path)
+    path.write_bytes(content + bytes(100))  # padded
+    assert read_image(path).shape == (64, 64, 3)
+
+
+def test_an_empty_file_or_a_folder_is_no_image(tmp_path):
+    (tmp_path / "a.png").touch()
+    for path in (tmp_path / "a.png", tmp_path):
+        with pytest.raises(sf.InputError, match="cannot be read as an image"):
+            read_image(path)
+
+
+def test_a_picture_that_is_cut_off_is_rendered_again(tmp_path):
+    write_dataset(tmp_path, 1, seed=3)
+    path = tmp_path / "images" / "000000.png"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-20])
+    write_dataset(tmp_path, 1, seed=3)
+    assert path.read_bytes() == whole
+
+
+def test_a_stamp_that_cannot_be_read_is_refused(tmp_path):
+    (tmp_path / "dataset.json").write_bytes(b"\xff\xfe")
+    with pytest.raises(sf.InputError, match=r"dataset\.json: not a text file"):
+        write_dataset(tmp_path, 1)
+    (tmp_path / "dataset.json").unlink()
+    (tmp_path / "dataset.json").mkdir()
+    with pytest.raises(sf.InputError, match=r"dataset\.json: cannot be read"):
+        write_dataset(tmp_path, 1)
+
+
+def test_a_file_that_cannot_be_written_leaves_no_part(tmp_path):
+    (tmp_path / "a.csv").mkdir()
+    with pytest.raises(sf.InputError, match=r"a\.csv: cannot be written"):
+        write_whole(tmp_path / "a.csv", "x")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]

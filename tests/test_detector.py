@@ -106,7 +106,8 @@ def test_an_answer_that_is_not_finite_is_refused(tmp_path):
         ({}, "not one of ours"),
         ({METADATA_KEY: "{}"}, "lacks format, size"),
         ({METADATA_KEY: "no json"}, "is not JSON"),
-        ({METADATA_KEY: "wrong size"}, "of no use"),
+        ({METADATA_KEY: "wrong size"}, "a size of no use"),
+        ({METADATA_KEY: "another size"}, "unlike its description"),
         ({METADATA_KEY: "format 2"}, "this version reads 1"),
     ],
 )
@@ -115,6 +116,8 @@ def test_a_model_that_does_not_describe_itself_is_refused(tmp_path, metadata, me
         metadata = {METADATA_KEY: json.dumps(json.loads(sf.KeypointDetector().info.to_json()) | {"format": 2})}
     if metadata.get(METADATA_KEY) == "wrong size":
         metadata = {METADATA_KEY: json.dumps(json.loads(sf.KeypointDetector().info.to_json()) | {"size": "224"})}
+    if metadata.get(METADATA_KEY) == "another size":
+        metadata = {METADATA_KEY: json.dumps(json.loads(sf.KeypointDetector().info.to_json()) | {"size": 128})}
     with pytest.raises(sf.InputError, match=message):
         sf.KeypointDetector(small_model(tmp_path / "m.onnx", metadata))
 

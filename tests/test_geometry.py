@@ -100,6 +100,13 @@ def test_unproject_refuses_a_pixel_beyond_the_lens_model():
         sf.unproject(sf.Camera(100, 100, 50, 50, 49.5, 49.5, (-0.3, 0, 0, 0)), [[300.0, 49.5]])
 
 
+def test_a_point_beyond_the_lens_model_is_refused_not_folded_back():
+    barrel = sf.Camera(960, 720, 600, 600, 479.5, 359.5, (-0.3, 0, 0, 0))
+    pose = sf.Pose.from_attitude([0, 0, 50])
+    with pytest.raises(sf.InputError, match="point 1 is outside the range of the camera's distortion"):
+        sf.project(barrel, pose, [[100, 0, 50], [100, -173, 50]])
+
+
 def test_window_keeps_pixel_centres_exact():
     # Halving: the centre of the output's first pixel is the corner shared by the first four source pixels.
     half = sf.PixelWindow.resize(8, 4, 4, 2)
@@ -125,6 +132,9 @@ def test_a_camera_seen_through_a_window_projects_where_the_window_maps():
     [
         (lambda: sf.Camera(0, 10, 1, 1, 0, 0), "must be positive"),
         (lambda: sf.Camera(10, 10, float("nan"), 1, 0, 0), "must be finite"),
+        (lambda: sf.Camera(10.5, 10, 1, 1, 0, 0), "width is 10.5"),
+        (lambda: sf.Camera(10, 10, "a", 1, 0, 0), "camera: fx"),
+        (lambda: sf.Camera(10, 10, 10**400, 1, 0, 0), "camera: fx"),
         (lambda: sf.Camera(10, 10, 1, 1, 0, 0, (1, 2, 3)), "3 coefficients"),
         (lambda: sf.Pose([0, 0, float("inf")], np.eye(3)), r"position_m: entry \[2\]"),
         (lambda: sf.Pose([0, 0, 1], np.diag([1, 1, -1])), "not a rotation"),

@@ -15,6 +15,7 @@ from shortfinal.integrity import (
     check_integrity_as_published,
     check_integrity_batch,
     check_integrity_batch_as_published,
+    detection_probability,
 )
 from shortfinal.pose import estimate_pose_batch
 
@@ -221,3 +222,45 @@ def test_wrong_bias_and_power_are_refused():
         sf.detection_probability(estimate(), np.ones((3, 2)))
     with pytest.raises(sf.InputError, match="power"):
         sf.minimal_detectable_bias(estimate(), FAULTS[0], 0.1, 0.05)
+
+
+def test_a_corner_that_is_hardly_known_leaves_nothing_to_check():
+    # Six sharp coordinates for six unknowns: any shift of a sharp corner is explained by another pose.
+    px = sf.project(CAMERA, on_approach(1200), RUNWAY.corners)
+    px[1] += [30.0, 0.0]
+    sigma = [[0.5], [0.5], [0.5], [1e4]]
+    verdict = sf.check_integrity(sf.estimate_pose(sf.GaussianKeypoints.from_sigma(px, sigma), RUNWAY.corners, CAMERA))
+    assert verdict.decision is Decision.NOT_MONITORED
+    assert "no redundancy in effect" in verdict.reasons[0]
+    cov = np.diag(np.repeat(np.square(np.ravel(sigma)), 2))
+    assert not check_integrity_batch(estimate_pose_batch(px[None], cov, RUNWAY.corners, CAMERA)).monitored[0]
+
+
+def test_a_pose_too_uncertain_for_a_linear_test_is_not_monitored():
+    est = solve(sf.project(CAMERA, on_approach(4000), RUNWAY.corners), sigma=15.0)
+    verdict = sf.check_integrity(est)
+    assert verdict.decision is Decision.NOT_MONITORED
+    assert "uncertain" in verdict.reasons[0]
+
+
+def test_the_batch_refuses_a_skew_covariance():
+    px = sf.project(CAMERA, on_approach(1200), RUNWAY.corners)
+    cov = 0.25 * np.eye(8)
+    cov[0, 1] = 50.0
+    batch = estimate_pose_batch(px[None], cov, RUNWAY.corners, CAMERA)
+    assert batch.status(0) is sf.SolverStatus.ILL_CONDITIONED
+    assert check_integrity_batch(batch).decision(0) is Decision.NOT_MONITORED
+
+
+def test_the_chance_of_a_false_alarm_does_not_saturate():
+    assert detection_probability(estimate(), np.zeros((4, 2)), 1e-18) == pytest.approx(1e-18)
+
+
+def test_estimates_cannot_be_changed_from_outside():
+    px = sf.project(CAMERA, on_approach(1200), RUNWAY.corners)
+    batch = estimate_pose_batch(px[None], 0.25 * np.eye(8), RUNWAY.corners, CAMERA)
+    one = batch[0]
+    batch.covs[:] = 0
+    assert np.trace(one.cov) > 0
+    with pytest.raises(ValueError, match="read-only"):
+        one.cov[0, 0] = 1

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -101,12 +102,34 @@ def test_what_cannot_be_looked_at_is_not_monitored(pipeline, frame, where, reaso
     assert reason in result.verdict.reasons[0]
 
 
-def test_a_picture_without_a_runway_is_not_accepted_with_confidence(pipeline):
-    # The network has no out-of-scope output yet; what it says of noise must not pass as a sharp pose.
-    noise = np.random.default_rng(0).integers(0, 256, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
-    result = pipeline.step(noise, box=BOX)
-    refused = result.verdict.decision is not Decision.USE
-    assert refused or result.keypoints.sigma_px.min() > 2.0
+def test_noise_is_hardly_ever_accepted(pipeline):
+    # The network has no output for "no runway" yet. Of 200 such frames 1 was accepted, with a position
+    # known to 43 % of the distance; if that is the rate, 50 frames hold more than 3 once in 10,000 runs.
+    rng = np.random.default_rng(0)
+    accepted = 0
+    for _ in range(50):
+        noise = rng.integers(0, 256, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
+        left, top, side = rng.uniform([100, 100, 40], [600, 500, 250])
+        result = pipeline.step(noise, box=[left, top, left + side, top + 0.7 * side])
+        accepted += result.verdict.decision is Decision.USE
+    assert accepted <= 3
+
+
+def test_a_flat_frame_is_not_looked_into(pipeline):
+    for level in (0, 128, 255):
+        result = pipeline.step(np.full((CAMERA.height, CAMERA.width, 3), level, np.uint8), box=BOX)
+        assert result.verdict.decision is Decision.NOT_MONITORED
+        assert "flat" in result.verdict.reasons[0]
+
+
+def test_a_model_of_other_keypoints_is_refused(pipeline):
+    class Other:
+        info = dataclasses.replace(pipeline.detector.info, keypoints=("near-left", "far-left"))
+
+    with pytest.raises(sf.InputError, match="its keypoints are near-left, far-left"):
+        sf.LandingPipeline(Other(), RUNWAY, CAMERA)
+    with pytest.raises(sf.InputError, match="false_alarm_rate"):
+        sf.LandingPipeline(pipeline.detector, RUNWAY, CAMERA, false_alarm_rate=5)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import pytest
 
 import shortfinal as sf
 from shortfinal.data.dataset import write_dataset
+from shortfinal.errors import JobError
 
 torch = pytest.importorskip("torch")
 
@@ -124,6 +125,8 @@ def test_export_describes_itself_and_equals_torch(recipe, tmp_path):
     assert detector.info == info
     assert info.keypoints == sf.CORNER_NAMES
     assert "median_px" in info.figures
+    with pytest.raises(sf.InputError, match="cannot be written"):
+        export(tmp_path / "best.pt", tmp_path)
     text = (tmp_path / "model.onnx").read_bytes()
     assert str(tmp_path).encode() not in text  # no trace of where it was made
     assert b".py" not in text
@@ -150,3 +153,33 @@ def test_what_is_no_checkpoint_is_refused(tmp_path, content):
     with pytest.raises(sf.InputError, match=r"x\.pt: "):
         export(path, tmp_path / "y.onnx")
     assert not (tmp_path / "y.onnx").exists()
+
+
+@pytest.mark.parametrize(
+    ("backbone", "message"),
+    [("nonsense", "'nonsense': Unknown model"), ("vit_tiny_patch16_224", "has the strides 16;")],
+)
+def test_a_backbone_that_does_not_do_is_named(backbone, message):
+    with pytest.raises(sf.InputError, match=message):
+        KeypointNet(backbone)
+
+
+def test_a_checkpoint_that_lacks_something_is_refused(tmp_path):
+    torch.save({"recipe": {}, "net": {}}, tmp_path / "x.pt")
+    with pytest.raises(sf.InputError, match=r"x\.pt: not a complete checkpoint: lacks average, optimizer"):
+        export(tmp_path / "x.pt", tmp_path / "y.onnx")
+
+
+def test_a_loss_that_is_not_finite_ends_the_run(recipe, tmp_path):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("shortfinal.train.fit.gaussian_nll", lambda error, log_variance: log_variance.mean() * np.nan)
+        with pytest.raises(JobError, match="diverged at step 1; lower --learning-rate"):
+            train(dataclasses.replace(recipe, out=str(tmp_path)))
+
+
+def test_an_error_in_a_worker_is_one_line(recipe, tmp_path):
+    write_dataset(tmp_path / "a", 1, seed=1)
+    (tmp_path / "a" / "images" / "000000.png").write_bytes(b"no picture")
+    with pytest.raises(sf.InputError, match=r"^[^\n]*000000\.png: cannot be read as an image$") as refusal:
+        train(dataclasses.replace(recipe, data=str(tmp_path / "a"), out=str(tmp_path / "run"), workers=1))
+    assert not str(refusal.value).startswith("shortfinal")

@@ -154,12 +154,9 @@ def audit_file(
 ) -> AuditReport:
     """Audit a LARD label file and write `audit.csv`, `audit.json` and `audit.png` into `out_dir`.
 
-    Options as in `audit_labels`. Raises InputError for an unreadable file, or one whose rows name
-    no camera when none is given.
+    Options as in `audit_labels`. Raises InputError for an unreadable file.
     """
     labels = read_labels(labels_csv, camera)
-    if all(label.camera is None for label in labels):
-        raise InputError(f"{labels_csv}: line 2: the file does not say which camera took the images; pass --camera")
     report = audit_labels(
         labels,
         load_database(runways_json),
@@ -220,7 +217,7 @@ def _audit(
 ) -> AuditedLabel:
     order = () if label.raw_order_ok else (Finding.ORDER,)
     if isinstance(runway, str) or camera is None:
-        return AuditedLabel(label, order, False, runway if isinstance(runway, str) else "camera unknown")
+        return AuditedLabel(label, order, False, runway if isinstance(runway, str) else "camera unknown: pass --camera")
     estimate = estimate_pose(GaussianKeypoints.from_sigma(label.corners_px, sigma_px), runway.corners, camera)
     return _audit_estimate(label, estimate, order, rate)
 
@@ -263,7 +260,7 @@ def _distance(position_m: Array, cov: Array, step_m: float, rate: float) -> tupl
     distance = float(np.linalg.norm(position_m))  # the threshold's middle is the origin
     towards = position_m / distance
     sigma = math.sqrt(towards @ cov[:3, :3] @ towards)
-    return distance, float(ndtri(1 - rate / 2)) * sigma + step_m / 2 + DISTANCE_ALLOWANCE * distance
+    return distance, -float(ndtri(rate / 2)) * sigma + step_m / 2 + DISTANCE_ALLOWANCE * distance
 
 
 def _blind_spots(estimate: PoseEstimate, rate: float) -> tuple[tuple[float, ...], float]:
@@ -385,7 +382,11 @@ def _headline(report: AuditReport) -> RenderableType:
     from rich.text import Text
 
     total, bad, unchecked = len(report.labels), len(report.contradicting), len(report.not_checked)
-    text = Text(f"{bad} of {total} labels contradict the runway", style="bold red" if bad else "bold green")
+    passed = sum(a.verdict == "passed" for a in report.labels)
+    text = Text(
+        f"{bad} of {total} labels contradict the runway, {passed} passed, {unchecked} not checked",
+        style="bold red" if bad else "bold green" if passed and not unchecked else "bold yellow",
+    )
     by_finding = ", ".join(f"{count} {name}" for name, count in report.counts.items() if count)
     text.append(f" ({by_finding})" if by_finding else "", style="default")
     if unchecked:

@@ -69,6 +69,10 @@ def _standardise(errors: ArrayLike, sigma: ArrayLike) -> tuple[Array, int, Array
     if s.shape != (*e.shape, e.shape[1]):
         raise InputError(f"sigma: expected covariances {(*e.shape, e.shape[-1])} for errors {e.shape}, got {s.shape}")
     _check_errors(e)
+    if not np.isfinite(s).all():
+        raise InputError("sigma: every entry of a covariance must be finite")
+    if (np.abs(s - s.swapaxes(1, 2)) > 1e-9 * np.abs(s).max(axis=(1, 2), keepdims=True)).any():
+        raise InputError("sigma: a covariance is not symmetric")
     try:
         factor = np.linalg.cholesky(s)
     except np.linalg.LinAlgError as error:

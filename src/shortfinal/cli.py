@@ -40,19 +40,30 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instea
 Model = Annotated[Path | None, typer.Option(help="Model file (ONNX); the one that ships by default.")]
 Rate = Annotated[float, typer.Option(help="Share of faultless frames that may be refused.")]
 CameraFile = Annotated[Path | None, typer.Option(help="Camera (TOML): width, height, fx, fy, cx, cy, distortion.")]
-Runways = Annotated[Path | None, typer.Option(help="Runway database (LARD's JSON), or set SHORTFINAL_RUNWAYS.")]
+Runways = Annotated[Path | None, typer.Option(help="Runway database (LARD's JSON).", envvar="SHORTFINAL_RUNWAYS")]
 
 
 def main() -> None:
     """Entry point: wrong input is one line on standard error and exit status 2."""
     try:
-        app()
+        sys.exit(app(standalone_mode=False))
     except InputError as error:
-        print(f"shortfinal: {error}", file=sys.stderr)  # noqa: T201
-        sys.exit(2)
+        _end(str(error), 2)
     except JobError as error:
-        print(f"shortfinal: {error}", file=sys.stderr)  # noqa: T201
-        sys.exit(1)
+        _end(str(error), 1)
+    except (typer.Abort, KeyboardInterrupt):
+        _end("stopped", 130)
+    except Exception as error:
+        message = getattr(error, "format_message", None)  # what the option parser raises
+        if message is None:
+            raise
+        _end(f"{message()}; see --help", 2)
+
+
+def _end(message: str, status: int) -> None:
+    """One line, whatever the names in it contain."""
+    print(f"shortfinal: {' '.join(message.split())}", file=sys.stderr)  # noqa: T201
+    sys.exit(status)
 
 
 @app.command()
@@ -116,7 +127,7 @@ def run(
 @app.command()
 def audit(
     labels: Annotated[Path, typer.Argument(help="LARD label file (v1 or v2).")],
-    runways: Annotated[Path, typer.Option(help="Runway database (LARD's JSON).")],
+    runways: Annotated[Path, typer.Option(help="Runway database (LARD's JSON).", envvar="SHORTFINAL_RUNWAYS")],
     out: Out = Path("results/audit"),
     sigma_px: Annotated[float | None, typer.Option(help="Of a label; what rounding gives by default.")] = None,
     false_alarm_rate: Rate = 1e-3,
@@ -180,7 +191,7 @@ def train(
     learning_rate: Annotated[float, typer.Option(min=0)] = 2e-3,
     validate_every: Annotated[int, typer.Option(help="Steps between validations and checkpoints.", min=1)] = 500,
     workers: Annotated[int, typer.Option(help="Processes that prepare crops.", min=0)] = 1,
-    seed: int = 0,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
 ) -> None:  # fmt: skip
     """Train a network on rendered scenes; run again with the same --out to go on after a stop."""
     from shortfinal.train.fit import Recipe

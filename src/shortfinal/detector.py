@@ -60,16 +60,30 @@ class ModelInfo:
         for name in ("mean", "std", "keypoints"):
             values[name] = tuple(values[name]) if isinstance(values[name], list) else ()
         info = cls(**values)
-        numbers = all(isinstance(v, (int, float)) for v in (*info.mean, *info.std, info.margin))
-        if not (isinstance(info.size, int) and len(info.mean) == len(info.std) == 3 and info.keypoints and numbers):
-            raise InputError(
-                f"{source}: its shortfinal description has a size, mean, std, margin or keypoints of no use"
-            )
+        wrong = info.first_wrong_field()
+        if wrong:
+            raise InputError(f"{source}: its description has a {wrong} of no use ({getattr(info, wrong)!r:.40})")
         return info
+
+    def first_wrong_field(self) -> str:
+        """The name of the first field whose value cannot be used, or nothing."""
+        checks = {
+            "size": type(self.size) is int and 16 <= self.size <= 4096,
+            "mean": len(self.mean) == 3 and all(_is_number(v) for v in self.mean),
+            "std": len(self.std) == 3 and all(_is_number(v) and v > 0 for v in self.std),
+            "keypoints": len(self.keypoints) > 0 and all(isinstance(name, str) for name in self.keypoints),
+            "covariance": isinstance(self.covariance, str),
+            "margin": _is_number(self.margin) and 1 <= self.margin <= 10,
+        }
+        return next((name for name, fine in checks.items() if not fine), "")
 
     def to_json(self) -> str:
         """The text `from_json` reads."""
         return json.dumps(asdict(self))
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 class KeypointDetector:
@@ -94,9 +108,11 @@ class KeypointDetector:
                 f"window: {window.out_width} x {window.out_height}; the model takes {self.info.size} x {self.info.size}"
             )
         batch = normalise(crop_image(image, window), self.info.mean, self.info.std)[None]
-        mean, cov = (
-            np.asarray(out[0], np.float64) for out in self._session.run(["mean_px", "cov_px"], {"image": batch})
-        )
+        try:
+            answer = self._session.run(["mean_px", "cov_px"], {"image": batch})
+        except Exception as error:  # ONNX Runtime has no common base class for what it raises
+            raise InputError(f"the model failed: {str(error).splitlines()[0][:120]}") from error
+        mean, cov = (np.asarray(out[0], np.float64) for out in answer)
         return GaussianKeypoints(window.inverse(mean), window.inverse_cov(cov))
 
 
@@ -176,4 +192,11 @@ def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo]:
         raise InputError(
             f"{source}: an ONNX model, but not one of ours: no {METADATA_KEY!r} metadata; see `shortfinal export`"
         )
-    return session, ModelInfo.from_json(text, str(source))
+    info = ModelInfo.from_json(text, str(source))
+    shape = tuple(session.get_inputs()[0].shape[1:])
+    outputs = [out.name for out in session.get_outputs()]
+    if shape != (3, info.size, info.size) or not {"mean_px", "cov_px"} <= set(outputs):
+        raise InputError(
+            f"{source}: it takes {shape} and gives {', '.join(outputs)}, unlike its description; export it again"
+        )
+    return session, info

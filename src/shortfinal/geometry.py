@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 BODY_FROM_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 _DISTORTION_LENGTHS = (0, 4, 5, 8)
+_FOLDED = 1e-6  # Jacobian determinant of the distortion beyond the radius where it is one-to-one
 
 
 def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
@@ -30,7 +31,7 @@ def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> Arra
     """
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         given = " ".join(repr(value).split())
         raise InputError(f"{name}: expected numbers, got {given:.80}") from error
     matches = array.ndim == len(shape) and all(
@@ -111,10 +112,13 @@ class Camera:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "distortion", tuple(float(k) for k in self.distortion))
-        values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(math.isfinite(v) for v in values):
-            raise InputError(f"camera: every intrinsic must be finite, got {values}")
+        for name in ("width", "height"):
+            if isinstance(getattr(self, name), bool) or not isinstance(getattr(self, name), (int, np.integer)):
+                raise InputError(f"camera: {name} is {getattr(self, name)!r}; it must be a whole number of pixels")
+        for name in ("fx", "fy", "cx", "cy"):
+            object.__setattr__(self, name, float(as_array(getattr(self, name), (), f"camera: {name}")))
+        distortion = as_array(self.distortion, (None,), "camera: distortion")
+        object.__setattr__(self, "distortion", tuple(float(k) for k in distortion))
         if min(self.width, self.height) < 1 or min(self.fx, self.fy) <= 0:
             raise InputError("camera: width, height, fx and fy must be positive")
         if len(self.distortion) not in _DISTORTION_LENGTHS:
@@ -206,12 +210,14 @@ class Pose:
 def project(camera: Camera, pose: Pose, points: ArrayLike) -> Array:
     """Pixels (K, 2) of `points` (K, 3), metres in the runway frame.
 
-    Raises InputError naming the first point that lies behind the camera.
+    Raises InputError naming the first point that lies behind the camera, or so far aside that the
+    distortion folds back on itself there.
     """
     px, _, depth = _project_all(camera, pose, points)
     if not (depth > 0).all():
         k = int(np.argmax(~(depth > 0)))
-        raise InputError(f"points: point {k} is behind the camera (depth {depth[k]:.2f} m)")
+        where = "outside the range of the camera's distortion" if np.isnan(depth[k]) else "behind the camera"
+        raise InputError(f"points: point {k} is {where}")
     return px
 
 
@@ -303,7 +309,7 @@ def normalise_kernel(u, v, k):  # type: ignore[no-untyped-def]
     for _ in range(50):
         a, b, xx, xy, yx, yy = distort_kernel(x, y, k)
         det = xx * yy - xy * yx
-        if not det > 1e-6:  # folded over: beyond the radius where the model is one-to-one
+        if not det > _FOLDED:
             return x, y, False
         ex, ey = a - xd, b - yd
         x -= (yy * ex - xy * ey) / det
@@ -338,6 +344,8 @@ def exp_kernel(w, out):  # type: ignore[no-untyped-def]
 def project_kernel(points, rotation, position, k, px, jacobian, depth):  # type: ignore[no-untyped-def]
     """Pixels (2K,), Jacobian (2K, 6) in the local increment, and depths (K,) of points (K, 3).
 
+    The depth is NaN where the distortion is no longer one-to-one: there is no such pixel.
+
     With Xc = Rt (P - p): dXc/dp = -Rt and, for R exp(dtheta), dXc/dtheta = [Xc]x.
     """
     for i in range(points.shape[0]):
@@ -351,6 +359,8 @@ def project_kernel(points, rotation, position, k, px, jacobian, depth):  # type:
         inverse = 1.0 / zc if zc != 0.0 else math.inf
         x, y = xc * inverse, yc * inverse
         xd, yd, xx, xy, yx, yy = distort_kernel(x, y, k)
+        if not xx * yy - xy * yx > _FOLDED:
+            depth[i] = math.nan
         px[2 * i] = k[0] * xd + k[2]
         px[2 * i + 1] = k[1] * yd + k[3]
         for row in range(2):

@@ -14,7 +14,7 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtrc, chdtri, chndtr, chndtrinc
+from scipy.special import chdtrc, chdtri, chndtrinc
 
 from shortfinal.errors import InputError
 from shortfinal.geometry import as_array
@@ -23,6 +23,7 @@ from shortfinal.pose import PoseEstimate, PoseEstimateBatch, SolverStatus
 Array = NDArray[np.float64]
 
 FALSE_ALARM_RATE = 1e-3
+LARGEST_SHARE = 0.5  # of the distance, that the position's sigma may reach
 
 
 class Decision(Enum):
@@ -69,7 +70,8 @@ def check_integrity(est: PoseEstimate, false_alarm_rate: float = FALSE_ALARM_RAT
     """Does the residual fit the stated uncertainty? DO_NOT_USE when p < `false_alarm_rate`.
 
     p is the survival function of χ²(2K - 6) at the squared whitened residual. NOT_MONITORED unless
-    the solver converged and a degree of freedom is left. Raises InputError for a rate outside (0, 1).
+    the solver converged, redundancy is left, and the pose is known well enough for a linear test.
+    Raises InputError for a rate outside (0, 1).
     """
     _check_rate(false_alarm_rate, "false_alarm_rate")
     obstacle = _obstacle(est)
@@ -92,6 +94,8 @@ def check_integrity_batch(batch: PoseEstimateBatch, false_alarm_rate: float = FA
     """`check_integrity` of N estimates, as arrays. Raises InputError for a rate outside (0, 1)."""
     _check_rate(false_alarm_rate, "false_alarm_rate")
     monitored = batch.converged & np.isfinite(batch.chi2) & (batch.dof > 0)
+    variances = np.diagonal(batch.cov_px, axis1=1, axis2=2)
+    monitored &= _redundant(batch.mean_px, variances) & _first_order(batch.positions, batch.covs, batch.points)
     statistic = np.where(monitored, batch.chi2, np.nan)
     dof = batch.dof
     p = np.asarray(chdtrc(dof, statistic)) if dof > 0 else np.full(len(batch), np.nan)
@@ -142,7 +146,11 @@ def detection_probability(est: PoseEstimate, bias_px: ArrayLike, false_alarm_rat
     """
     _check_rate(false_alarm_rate, "false_alarm_rate")
     threshold = float(chdtri(_solved(est).dof, false_alarm_rate))
-    return 1.0 - float(chndtr(threshold, est.dof, _noncentrality(est, bias_px)))
+    from scipy.stats import ncx2  # its survival function does not saturate; slow to import
+
+    noncentrality = _noncentrality(est, bias_px)
+    tail = ncx2.sf(threshold, est.dof, noncentrality) if noncentrality > 0 else chdtrc(est.dof, threshold)
+    return float(tail)
 
 
 def minimal_detectable_bias(
@@ -164,11 +172,13 @@ def minimal_detectable_bias(
     unit = _noncentrality(est, direction_px)
     # Below the rounding of the projection the share left over is none.
     total = float(np.sum(_whitened(est, direction_px) ** 2))
+    if total == 0:
+        raise InputError("direction_px: a shift of nothing has no direction")
     return math.sqrt(needed / unit) if unit > 1e-20 * total else math.inf
 
 
 def _check_rate(rate: float, name: str) -> None:
-    if not 0 < rate < 1:
+    if not (isinstance(rate, (int, float)) and 0 < rate < 1):
         raise InputError(f"{name}: {rate} is no probability; it must lie between 0 and 1, e.g. {FALSE_ALARM_RATE}")
 
 
@@ -180,7 +190,27 @@ def _obstacle(est: PoseEstimate) -> str | None:
         return f"no redundancy: {len(est.residual)} equations for 6 unknowns"
     if not math.isfinite(est.chi2):
         return f"the residual is {est.chi2}"
+    variances = np.diagonal(est.keypoints.cov_px)[None]
+    if not _redundant(est.keypoints.mean_px[None], variances)[0]:
+        return "no redundancy in effect: too few corners are known better than the runway is large in the image"
+    assert est.pose is not None  # as it converged
+    assert est.cov is not None
+    if not _first_order(est.pose.position_m[None], est.cov[None], est.points[None])[0]:
+        return f"the position is uncertain by more than {LARGEST_SHARE:.0%} of the distance: no longer first-order"
     return None
+
+
+def _redundant(mean_px: Array, variances: Array) -> NDArray[np.bool_]:
+    """Whether more than six coordinates are measurements (N,): known better than the runway's extent."""
+    extent = np.ptp(mean_px, axis=1).max(axis=1)
+    return np.asarray((variances < extent[:, None] ** 2).sum(axis=1) > 6)
+
+
+def _first_order(positions: Array, covs: Array, points: Array) -> NDArray[np.bool_]:
+    """Whether the pose is known well enough (N,) for the linearisation that covariance and test rest on."""
+    distance = np.linalg.norm(points - positions[:, None], axis=2).min(axis=1)
+    spread = np.sqrt(np.trace(covs[:, :3, :3], axis1=1, axis2=2))
+    return np.asarray(spread < LARGEST_SHARE * distance)
 
 
 def _solved(est: PoseEstimate) -> PoseEstimate:

@@ -12,6 +12,8 @@ from shortfinal.geometry import as_array
 
 Array = NDArray[np.float64]
 
+_FARTHEST_PX = 1e6
+
 CORNER_NAMES = ("near-left", "near-right", "far-right", "far-left")
 
 
@@ -31,6 +33,8 @@ class GaussianKeypoints:
         mean = as_array(self.mean_px, (None, 2), "mean_px")
         if len(mean) == 0:
             raise InputError("mean_px: at least one keypoint is needed")
+        if np.abs(mean).max() > _FARTHEST_PX:
+            raise InputError(f"mean_px: {np.abs(mean).max():.3g} is no pixel of any camera")
         cov = as_array(self.cov_px, (2 * len(mean), 2 * len(mean)), "cov_px")
         _check_covariance(cov)
         object.__setattr__(self, "mean_px", mean)
@@ -50,7 +54,7 @@ class GaussianKeypoints:
         if not (np.isfinite(sigma) & (sigma > 0)).all():
             k, axis = (int(i) for i in np.argwhere(~(np.isfinite(sigma) & (sigma > 0)))[0])
             raise InputError(f"sigma_px: keypoint {k} {'uv'[axis]} is {sigma[k, axis]}; it must be finite and > 0")
-        return cls(mean, np.diag(sigma.ravel() ** 2))
+        return cls(mean, np.diag(np.minimum(sigma, 2 * _FARTHEST_PX).ravel() ** 2))
 
     @property
     def sigma_px(self) -> Array:
@@ -69,6 +73,8 @@ class GaussianKeypoints:
 
 def _check_covariance(cov: Array) -> None:
     variance = np.diag(cov)
+    if variance.max() > _FARTHEST_PX**2:
+        raise InputError(f"cov_px: a standard deviation of {np.sqrt(variance.max()):.3g} px is no measurement")
     if (variance <= 0).any():
         row = int(np.argmax(variance <= 0))
         raise InputError(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shortfinal.crops import box_around, centre_crop
-from shortfinal.detector import Image, KeypointDetector, check_image
+from shortfinal.detector import Image, KeypointDetector, check_image, crop_image
 from shortfinal.errors import InputError
 from shortfinal.geometry import Camera, PixelWindow, Pose, as_array, project
 from shortfinal.integrity import Decision, IntegrityVerdict, check_integrity
@@ -25,6 +25,7 @@ T = TypeVar("T")
 
 WIDE_MARGIN = 1.9  # of the first crop around a prior pose: the widest that training uses
 LOOKS = 3  # crops at most, for a frame
+FLAT = 1.5  # standard deviation of a crop's levels, of 255, below which nothing can be in it
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +74,13 @@ class LandingPipeline:
     def __init__(
         self, detector: KeypointDetector, runway: Runway, camera: Camera, *, false_alarm_rate: float = 1e-3
     ) -> None:
+        """Raises InputError for a rate outside (0, 1) or a model whose keypoints are not the four corners."""
+        if detector.info.keypoints != CORNER_NAMES:
+            raise InputError(
+                f"detector: its keypoints are {', '.join(detector.info.keypoints)}; expected {', '.join(CORNER_NAMES)}"
+            )
+        if not (isinstance(false_alarm_rate, (int, float)) and 0 < false_alarm_rate < 1):
+            raise InputError(f"false_alarm_rate: {false_alarm_rate!r}; it must lie between 0 and 1")
         self.detector, self.runway, self.camera = detector, runway, camera
         self.false_alarm_rate = false_alarm_rate
         self._last: Pose | None = None
@@ -137,6 +145,8 @@ class LandingPipeline:
         margin, size = self.detector.info.margin, self.detector.info.size
         wide = margin if box is not None else WIDE_MARGIN
         window = centre_crop(self._first_box(box, prior), wide, size)
+        if crop_image(frame, window).std() < FLAT:
+            raise InputError("nothing to see: the crop is flat")
         keypoints = self.detector.detect(frame, window)
         for _ in range(LOOKS - 1):
             if _frames(window, keypoints, margin):

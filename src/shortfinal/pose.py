@@ -293,16 +293,22 @@ def _estimate(result: _Result, i: int, keypoints: GaussianKeypoints, points: Arr
     solved = status in (SolverStatus.CONVERGED, SolverStatus.AMBIGUOUS)
     return PoseEstimate(
         pose=Pose(result.positions[i], result.rotations[i]) if solved else None,
-        cov=result.covs[i] if solved else None,
+        cov=_frozen(result.covs[i]) if solved else None,
         status=status,
-        residual=result.residuals[i],
-        jacobian=result.jacobians[i],
+        residual=_frozen(result.residuals[i]),
+        jacobian=_frozen(result.jacobians[i]),
         chi2=float(result.chi2[i]),
         iterations=int(result.iterations[i]),
         keypoints=keypoints,
         points=points,
         camera=camera,
     )
+
+
+def _frozen(array: Array) -> Array:
+    copy = array.copy()
+    copy.setflags(write=False)
+    return copy
 
 
 # The kernels below are compiled. They work in memory the caller owns: nothing is allocated per
@@ -359,11 +365,16 @@ def _planar_kernel(k):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _admit_kernel(problem):  # type: ignore[no-untyped-def]
-    """Refuse NaN and infinity; replace the covariance by its Cholesky factor."""
+    """Refuse NaN, infinity and a skew covariance; replace the covariance by its Cholesky factor."""
     for array in (problem.mean, problem.points.ravel(), problem.whitener.ravel()):
         for value in array:
             if not math.isfinite(value):
                 return _NON_FINITE
+    cov = problem.whitener
+    for i in range(cov.shape[0]):
+        for j in range(i):
+            if abs(cov[i, j] - cov[j, i]) > 1e-8 * math.sqrt(abs(cov[i, i] * cov[j, j])):
+                return _ILL_CONDITIONED
     return _CONVERGED if _cholesky_kernel(problem.whitener) > _SINGULAR else _ILL_CONDITIONED
 
 
@@ -524,7 +535,7 @@ def _evaluate_kernel(problem, state):  # type: ignore[no-untyped-def]
         problem.depth,
     )
     for depth in problem.depth:
-        if depth <= 0.0:
+        if not depth > 0.0:  # behind, or NaN: beyond the range of the distortion
             return math.inf
     return _whiten_kernel(problem.whitener, problem.mean, state.residual, state.jacobian)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shortfinal.errors import InputError
-from shortfinal.geometry import Camera
+from shortfinal.geometry import Camera, as_array
 from shortfinal.keypoints import GaussianKeypoints
 from shortfinal.pose import PoseEstimate, estimate_pose
 from shortfinal.runway import Runway
@@ -42,10 +42,10 @@ def read_problem(path: str | Path) -> PoseProblem:
     {"length_m", "width_m"}}. Raises InputError naming the file and the field.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path}: cannot read the problem: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a JSON file: {error}") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a JSON object with camera, keypoints_px, sigma_px and runway")
@@ -58,7 +58,7 @@ def read_problem(path: str | Path) -> PoseProblem:
 def _problem(content: dict[str, Any], source: str) -> PoseProblem:
     camera = _build(Camera, _field(content, "camera"), "camera")
     if "points_m" in content:
-        points = np.asarray(content["points_m"])
+        points = as_array(content["points_m"], (None, 3), "points_m")
     else:
         points = _build(Runway, _field(content, "runway"), "runway").corners
     mean = _field(content, "keypoints_px")
@@ -84,7 +84,8 @@ def _field(content: dict[str, Any], name: str) -> Any:
 
 
 def _build(kind: Any, values: Any, name: str) -> Any:
-    try:
-        return kind(**values)
-    except TypeError as error:
-        raise InputError(f"{name}: {error}") from error
+    known = {field.name for field in fields(kind)}
+    needed = {field.name for field in fields(kind) if field.default is MISSING}
+    if not isinstance(values, dict) or not needed <= set(values) <= known:
+        raise InputError(f"{name}: expected an object with {', '.join(sorted(needed))}, got {values!r:.80}")
+    return kind(**values)

@@ -17,6 +17,7 @@ from shortfinal.geometry import as_array
 
 Array = NDArray[np.float64]
 
+_LONGEST_M = 1e5
 DATABASE_VARIABLE = "SHORTFINAL_RUNWAYS"
 
 
@@ -36,8 +37,9 @@ class Runway:
     def __post_init__(self) -> None:
         for name in ("length_m", "width_m"):
             value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"runway {self.ident}: {name} is {value}; it must be > 0")
+            number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+            if not (number and 0 < value < _LONGEST_M):
+                raise InputError(f"runway {self.ident}: {name} is {value!r}; it must be > 0, in metres")
         half = self.width_m / 2
         flat = [[0, half, 0], [0, -half, 0], [self.length_m, -half, 0], [self.length_m, half, 0]]
         given: ArrayLike = flat if self.corners is None else self.corners
@@ -60,7 +62,7 @@ class Runway:
         mean = lla[:2].mean(axis=0)
         enu = np.column_stack(pymap3d.geodetic2enu(*lla.T, *mean))
         centre, far = enu[:2].mean(axis=0), enu[2:].mean(axis=0)
-        heading = (far - centre)[:2] / np.linalg.norm((far - centre)[:2])
+        heading = (far - centre)[:2] / max(1e-9, float(np.linalg.norm((far - centre)[:2])))
         # Rows: along, left (a quarter turn from along), up.
         runway_from_enu = np.array([[*heading, 0.0], [-heading[1], heading[0], 0.0], [0.0, 0.0, 1.0]])
         local = (enu - centre) @ runway_from_enu.T
@@ -101,10 +103,10 @@ def find_runway(ident: str, database: str | Path | None = None) -> Runway:
 def load_database(path: str | Path) -> dict[str, Any]:
     """The database file as it is: {airport: {direction: {A, B, C, D: ...}}}. Raises InputError."""
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path}: cannot read the runway database: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a JSON runway database: {error}") from error
     if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
         raise InputError(f"{path}: expected {{airport: {{direction: corners}}}} as in LARD's database")

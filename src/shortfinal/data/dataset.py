@@ -47,7 +47,7 @@ class Example:
     corners_px: Array  # (4, 2), keypoint order
 
 
-def random_approach(rng: np.random.Generator, runway: Runway) -> Pose:
+def random_approach(rng: np.random.Generator) -> Pose:
     """A camera in LARD's approach cone, somewhat widened (LARD, Ducoffe et al. 2023, table 1).
 
     Slant distance 0.05 to 4.5 NM, log-uniform; glide angle 1.8 to 4.5 degrees at an apex 305 m past
@@ -98,7 +98,7 @@ def plan_shot(seed: int, index: int) -> Shot:
     rng = np.random.default_rng([seed, index])
     scene = random_scene(rng)
     runway = Runway(scene.length, scene.width)
-    pose = random_approach(rng, runway)
+    pose = random_approach(rng)
     unit = Camera(1, 1, 1000.0, 1000.0 * rng.uniform(0.9, 1.1), 0.0, 0.0)
     box = box_around(project(unit, pose, runway.corners))
     side = float(np.exp(rng.uniform(np.log(11.0), np.log(200.0))))
@@ -128,7 +128,7 @@ def write_dataset(
     def one(index: int) -> dict[str, str]:
         name = f"images/{index:06d}.png"
         shot = plan_shot(seed, index)
-        if not (folder / name).exists():
+        if not _is_whole_png(folder / name):
             write_png(folder / name, shot.render().image)
         if progress:
             progress(index)
@@ -147,9 +147,26 @@ def write_dataset(
 def _claim(stamp: Path, seed: int) -> None:
     """Note the seed in the folder, or refuse a folder of another seed."""
     text = json.dumps({"seed": seed})
-    if stamp.exists() and stamp.read_text() != text:
+    try:
+        there = stamp.read_text(encoding="utf-8") if stamp.exists() else text
+    except OSError as error:
+        raise InputError(f"{stamp}: cannot be read: {error.strerror}; choose an empty folder") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{stamp}: not a text file; choose an empty folder") from error
+    if there != text:
         raise InputError(f"{stamp.parent}: holds a data set of another seed; choose an empty folder or the same --seed")
     write_whole(stamp, text)
+
+
+def _is_whole_png(path: Path) -> bool:
+    """Whether the file is there and ends as a PNG does, with its IEND chunk of 12 bytes."""
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(size - 12, 0))
+            return b"IEND" in file.read()
+    except OSError:
+        return False
 
 
 class RenderedDataset:
@@ -167,7 +184,10 @@ class RenderedDataset:
 
 
 def read_dataset(folder: str | Path) -> RenderedDataset:
-    """A data set written by `write_dataset`. Raises InputError naming the file, the line and the field."""
+    """A data set written by `write_dataset`.
+
+    Raises InputError naming the file, the line and the field, or the first picture that is missing.
+    """
     path = Path(folder) / "labels.csv"
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -176,6 +196,8 @@ def read_dataset(folder: str | Path) -> RenderedDataset:
         raise InputError(
             f"{path}: cannot read the labels: {error.strerror}; `shortfinal data render` writes them"
         ) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: not a text file of labels: {error}") from error
     if not rows:
         raise InputError(f"{path}: no rows")
     missing = [c for c in ("image", *_CORNER_COLUMNS) if c not in rows[0]]
@@ -185,7 +207,11 @@ def read_dataset(folder: str | Path) -> RenderedDataset:
     for number, row in enumerate(rows):
         for column, name in enumerate(_CORNER_COLUMNS):
             corners[number, column] = _number(path, number + 2, name, row[name])
-    return RenderedDataset(path.parent, [row["image"] for row in rows], corners.reshape(-1, 4, 2))
+    names = [row["image"] or "" for row in rows]
+    for number, name in enumerate(names):
+        if not os.path.isfile(os.path.join(path.parent, name)):
+            raise InputError(f"{path}: line {number + 2}: {path.parent / name}: no such image")
+    return RenderedDataset(path.parent, names, corners.reshape(-1, 4, 2))
 
 
 def _number(path: Path, line: int, field: str, text: str) -> float:
@@ -199,11 +225,24 @@ def _number(path: Path, line: int, field: str, text: str) -> float:
 
 
 def read_image(path: str | Path) -> Image:
-    """An image file as RGB (h, w, 3) uint8. Raises InputError if it is missing or no image."""
+    """An image file as RGB (h, w, 3) uint8, as stored: labels are in stored pixels, so EXIF does not turn it.
+
+    Raises InputError if it is missing, no image, or cut off.
+    """
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"{path}: no such image")
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read as an image: {error.strerror}") from error
+    # libjpeg fills what is missing with grey. Some cameras pad behind the end marker.
+    if content.startswith(b"\xff\xd8") and b"\xff\xd9" not in content.rstrip(b"\0")[-64:]:
+        raise InputError(f"{path}: truncated JPEG")
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:  # of an empty file, or one that claims too large a picture
+        image = None
     if image is None:
         raise InputError(f"{path}: cannot be read as an image")
     return np.ascontiguousarray(image[..., ::-1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -23,19 +24,28 @@ class _Partial:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.partial = partial_of(self.path)
+        if self.path.is_dir():
+            raise InputError(f"{self.path}: cannot be written: Is a directory")
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
-        self.close()
-        if kind is None and self.partial.exists():
-            self.partial.replace(self.path)
-        else:
-            self.partial.unlink(missing_ok=True)
+        try:
+            self.close()
+            if kind is None and self.partial.exists():
+                self.partial.replace(self.path)
+        except OSError as problem:
+            raise self._refusal(problem) from problem
+        finally:
+            with suppress(OSError):
+                self.partial.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Flush what was written."""
+
+    def _refusal(self, error: OSError) -> InputError:
+        return InputError(f"{self.path}: cannot be written: {error.strerror}")
 
 
 class JsonlWriter(_Partial):
@@ -46,11 +56,15 @@ class JsonlWriter(_Partial):
         try:
             self._file = self.partial.open("w", encoding="utf-8")
         except OSError as error:
-            raise InputError(f"{self.path}: cannot be written: {error.strerror}") from error
+            raise self._refusal(error) from error
 
     def write(self, record: dict[str, Any]) -> None:
         """Append one record. NaN and infinity are no JSON, and an error."""
-        self._file.write(json.dumps(record, allow_nan=False) + "\n")
+        line = json.dumps(record, allow_nan=False) + "\n"
+        try:
+            self._file.write(line)
+        except OSError as error:
+            raise self._refusal(error) from error
 
     def close(self) -> None:
         """Flush the lines."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import math
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,7 +13,8 @@ from numpy.typing import NDArray
 
 from shortfinal.crops import box_around
 from shortfinal.data.dataset import read_image
-from shortfinal.data.lard import read_labels
+from shortfinal.data.lard import _records, read_labels
+from shortfinal.data.lard import _Row as _Cells
 from shortfinal.errors import InputError
 from shortfinal.geometry import Camera, PixelWindow
 from shortfinal.runway import Runway, find_in_database, load_database
@@ -73,9 +72,14 @@ class LabelledFolder:
         return (row.frame() for row in self._rows)
 
     def _read(self) -> list[_Row]:
-        header = _header(self.labels)
-        if set(_BOX) <= set(header):
-            return [self._boxed(line, record) for line, record in _records(self.labels)]
+        records = list(_records(self.labels))
+        if records and set(_BOX) <= set(columns := records[0].cells):
+            twice = [name for name in columns if columns.count(name) > 1]
+            if twice:
+                raise InputError(f"{self.labels}: line 1: column {twice[0]!r} stands there twice; keep one")
+            if len(records) == 1:
+                raise InputError(f"{self.labels}: a header without rows; expected one box per line")
+            return [self._boxed(_Cells(self.labels, record.line, columns, record.cells)) for record in records[1:]]
         rows = []
         for label in read_labels(self.labels):
             where = f"{self.labels}: line {label.line}"
@@ -94,15 +98,15 @@ class LabelledFolder:
             )
         return rows
 
-    def _boxed(self, line: int, record: dict[str, str]) -> _Row:
-        where = f"{self.labels}: line {line}"
+    def _boxed(self, cells: _Cells) -> _Row:
+        where = f"{self.labels}: line {cells.line}"
         if self._camera is None:
             raise InputError(f"{where}: a box file does not say which camera took the picture; pass --camera")
-        box = np.array([_number(record.get(name), f"{where}: {name}") for name in _BOX])
+        box = np.array([cells.number(name) for name in _BOX])
         if not (box[:2] < box[2:]).all():
             raise InputError(f"{where}: the box must have left < right and top < bottom, got {box.tolist()}")
-        runway = self._runway_for(record.get("runway") or "", where)
-        return _Row(self._image(record.get("image") or "", where), self._camera, None, runway, box, None, None)
+        runway = self._runway_for(cells.get("runway"), where)
+        return _Row(self._image(cells.get("image"), where), self._camera, None, runway, box, None, None)
 
     def _image(self, name: str, where: str) -> Path:
         """The file of that name in the folder, or in its `images`, whatever folder the label had it in."""
@@ -182,35 +186,3 @@ def read_camera(path: str | Path) -> Camera:
         return Camera(**{n: content[n] for n in names}, distortion=tuple(distortion))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-
-
-def _header(path: Path) -> list[str]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            line = file.readline()
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the labels: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file of labels: {error}") from error
-    return [cell.strip() for cell in line.split(";" if ";" in line else ",")]
-
-
-def _records(path: Path) -> list[tuple[int, dict[str, str]]]:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        delimiter = ";" if ";" in file.readline() else ","
-        file.seek(0)
-        reader = csv.DictReader(file, delimiter=delimiter)
-        rows = [(reader.line_num, record) for record in reader]
-    if not rows:
-        raise InputError(f"{path}: a header without rows; expected one box per line")
-    return rows
-
-
-def _number(text: str | None, what: str) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(f"{what} is {text!r}; it must be a finite number")
-    return value

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from shortfinal.detector import FORMAT, METADATA_KEY, ModelInfo
 from shortfinal.errors import InputError, JobError
+from shortfinal.files import write_whole
 from shortfinal.keypoints import CORNER_NAMES
 from shortfinal.train.fit import MEAN, STD, load_checkpoint
 from shortfinal.train.model import KeypointNet, to_pixels, variance_px
@@ -82,7 +83,7 @@ def export(checkpoint: str | Path, out: str | Path) -> ModelInfo:
         difference = compare(draft, model, info.size)
         if difference > TOLERANCE:
             raise JobError(f"{checkpoint}: ONNX Runtime differs from torch by {difference:.1e}; not written")
-        draft.replace(target)
+        write_whole(target, draft.read_bytes())
     return info
 
 
@@ -104,4 +105,6 @@ def compare(path: str | Path, model: GaussianNet, size: int, count: int = 16, se
 def _folder_of(path: Path) -> Path:
     if not path.parent.is_dir():
         raise InputError(f"{path}: no such folder {path.parent}; make it first")
+    if path.is_dir():
+        raise InputError(f"{path}: cannot be written: Is a directory")
     return path.parent

@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader, Dataset
 from shortfinal.crops import bogo_crop, box_around, centre_crop
 from shortfinal.data.dataset import Example, read_dataset
 from shortfinal.detector import crop_image, normalise
-from shortfinal.errors import InputError
+from shortfinal.errors import InputError, JobError
 from shortfinal.files import make_folder, write_whole
 from shortfinal.geometry import PixelWindow
 from shortfinal.train.model import KeypointNet, gaussian_nll, to_pixels, variance_px
@@ -205,6 +205,8 @@ class Run:
             loss = 0.1 * error.abs().mean() + gaussian_nll(error.detach(), log_variance)
         else:
             loss = gaussian_nll(error, log_variance)
+        if not math.isfinite(float(loss.detach())):
+            raise JobError(f"diverged at step {self.step + 1}; lower --learning-rate")
         self.optimizer.zero_grad(set_to_none=True)
         self.fabric.backward(loss)
         self.fabric.clip_gradients(self.model, self.optimizer, max_norm=5.0)
@@ -238,6 +240,11 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
         raise InputError(f"{path}: not a checkpoint: {str(error).splitlines()[0][:120]}") from error
     if not isinstance(state, dict) or "recipe" not in state:
         raise InputError(f"{path}: a torch file, but not a checkpoint of shortfinal train")
+    recipe = state["recipe"] if isinstance(state["recipe"], dict) else {}
+    lacks = [key for key in (*Run._PARTS, "step", "history") if key not in state]
+    lacks += [f"recipe.{field.name}" for field in fields(Recipe) if field.name not in recipe]
+    if lacks or not state["history"]:
+        raise InputError(f"{path}: not a complete checkpoint: lacks {', '.join(lacks) or 'history'}")
     return state
 
 
@@ -255,14 +262,18 @@ def train(recipe: Recipe, console: Console | None = None) -> dict[str, float]:
     draws = _Draws(recipe, run.step * recipe.batch)
     batches: Any = run.fabric.setup_dataloaders(DataLoader(draws, batch_size=recipe.batch, num_workers=recipe.workers))
     smooth = math.nan
-    with _bar(console) as bar:
-        task = bar.add_task("training", total=recipe.steps, completed=run.step, note="")
-        for image, corners in batches:
-            loss = run.advance(image, corners)
-            smooth = loss if math.isnan(smooth) else 0.98 * smooth + 0.02 * loss
-            bar.update(task, completed=run.step, note=f"loss {smooth:.3f}" + _brief(run.history))
-            if run.step % recipe.validate_every == 0 or run.step == recipe.steps:
-                run.record({"step": run.step, "loss": smooth, **validate(run.average, held, recipe.size)})
+    try:
+        with _bar(console) as bar:
+            task = bar.add_task("training", total=recipe.steps, completed=run.step, note="")
+            for image, corners in batches:
+                loss = run.advance(image, corners)
+                smooth = loss if math.isnan(smooth) else 0.98 * smooth + 0.02 * loss
+                bar.update(task, completed=run.step, note=f"loss {smooth:.3f}" + _brief(run.history))
+                if run.step % recipe.validate_every == 0 or run.step == recipe.steps:
+                    run.record({"step": run.step, "loss": smooth, **validate(run.average, held, recipe.size)})
+    except InputError as error:  # a worker's comes with its traceback before it
+        line = str(error).strip().splitlines()[-1]
+        raise InputError(line.removeprefix("shortfinal.errors.InputError: ")) from error
     return min(run.history, key=lambda row: row["nll"])
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from shortfinal.errors import InputError
 from shortfinal.train import timm
 
 MIN_SIGMA_PX = 0.03  # keeps the likelihood finite on a picture seen too often
@@ -33,8 +34,16 @@ class KeypointNet(nn.Module):
         pretrained: bool = False,
     ) -> None:
         super().__init__()
-        probe: Any = timm.create_model(backbone, features_only=True, pretrained=False)
-        every = probe.feature_info.reduction()
+        try:
+            probe: Any = timm.create_model(backbone, features_only=True, pretrained=False)
+        except (RuntimeError, AttributeError) as error:  # timm's: no such model, or one without feature maps
+            raise InputError(f"backbone: {backbone!r}: {str(error).strip().splitlines()[0]}") from error
+        every: list[int] = probe.feature_info.reduction()
+        if not set(strides) <= set(every):
+            raise InputError(
+                f"backbone: {backbone!r} has the strides {', '.join(map(str, sorted(set(every))))}; "
+                f"{', '.join(map(str, strides))} are needed"
+            )
         taken = [len(every) - 1 - every[::-1].index(stride) for stride in strides]
         features: Any = timm.create_model(backbone, features_only=True, pretrained=pretrained, out_indices=taken)
         self.backbone = features
