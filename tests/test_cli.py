@@ -170,6 +170,7 @@ def test_files_that_are_missing_or_not_what_they_should_be(folder, capsys):
         ("60.png,a,1,5,5", "line 2: left is 'a'"),
         ("60.png,9,1,5,5", "line 2: the box must have"),
         ("60.png,1,1,5", "line 2: 4 cells under 5 columns"),
+        ("60.png,1,1,5,5,5", "line 2: 6 cells under 5 columns"),
         ("61.png,1,1,5,5", "line 2: image '61.png' is not in"),
         (",1,1,5,5", "line 2: image '' is not in"),
     ],
@@ -180,6 +181,19 @@ def test_box_files(folder, capsys, line, message):
     assert "labels.csv" in err
     assert message in err
     assert not (folder / "out" / "frames.jsonl").exists()
+
+
+def test_a_column_twice(folder, capsys):
+    (folder / "labels.csv").write_text("image, left, top, right, bottom, left\n60.png,1,1,5,5,2\n")
+    assert "column 'left' stands there twice" in refused(capsys, *run_arguments(folder))
+
+
+def test_a_truncated_jpeg(folder, capsys):
+    picture = cv2.imread(str(folder / "80.png"))
+    cv2.imwrite(str(folder / "80.jpg"), picture)
+    (folder / "80.jpg").write_bytes((folder / "80.jpg").read_bytes()[:20_000])
+    (folder / "labels.csv").write_text((folder / "labels.csv").read_text().replace("80.png", "80.jpg"))
+    assert "80.jpg: truncated JPEG" in refused(capsys, *run_arguments(folder))
 
 
 def test_an_unreadable_picture_leaves_nothing_behind(folder, capsys):
