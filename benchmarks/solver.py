@@ -53,7 +53,6 @@ def _problem(rng: np.random.Generator) -> Problem:
         position = distance * np.array([-1.0, np.tan(lateral), np.tan(glide)])
         truth = sf.Pose.from_attitude(position, *rng.uniform([-10, -8, -10], [10, 0, 10]))
         points = sf.Runway(rng.uniform(1500, 3500), rng.uniform(30, 60)).corners
-        assert points is not None
         px = sf.project(CAMERA, truth, points)
         if (px >= 0).all() and (px <= [CAMERA.width - 1, CAMERA.height - 1]).all():
             break

@@ -76,9 +76,10 @@ def test_without_a_box_it_looks_where_the_last_accepted_frame_was(frame):
 
 
 def test_a_slid_corner_is_refused(pipeline, frame):
-    result = pipeline.step(frame, box=BOX, alter=inject(Fault.NEAR_CORNER, TRUTH))
-    assert result.verdict.decision is Decision.DO_NOT_USE
-    assert "do not fit the runway" in result.verdict.reasons[0]
+    found = pipeline.step(frame, box=BOX).keypoints
+    _, verdict = pipeline.judge(inject(Fault.NEAR_CORNER, TRUTH)(found))
+    assert verdict.decision is Decision.DO_NOT_USE
+    assert "do not fit the runway" in verdict.reasons[0]
 
 
 def test_the_record_is_plain_json(pipeline, frame):

@@ -8,7 +8,6 @@ check" is a result of its own and never looks like "passed".
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 import math
@@ -26,7 +25,7 @@ from scipy.special import chdtrc, chdtri, chndtr, chndtrinc, ndtri
 
 from shortfinal.data.lard import RunwayLabel, read_labels
 from shortfinal.errors import InputError
-from shortfinal.files import make_folder, write_whole
+from shortfinal.files import csv_text, make_folder, write_whole
 from shortfinal.geometry import Camera, project
 from shortfinal.integrity import Decision, check_integrity
 from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
@@ -361,11 +360,7 @@ def _finite(value: float | None) -> float | None:
 
 def _table(report: AuditReport) -> str:
     rows = [_row(audited) for audited in report.labels]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]) if rows else ["line"], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return csv_text(rows[0] if rows else ["line"], rows)
 
 
 def render_summary(report: AuditReport, worst: int = 10) -> RenderableType:

@@ -269,18 +269,21 @@ def _run_folder(
 
 def _compile(*, scenes: bool) -> None:
     """Compile the kernels, which takes half a minute the first time, with something to look at."""
-    from shortfinal.data.scene import render
-    from shortfinal.demo import CAMERA, RUNWAY, approach_pose, demo_scene
-    from shortfinal.geometry import PixelWindow, project
+    import numpy as np
+
+    from shortfinal.geometry import Camera, Pose, project
     from shortfinal.keypoints import GaussianKeypoints
     from shortfinal.pose import estimate_pose
+    from shortfinal.runway import Runway
 
     with console.status("compiling the kernels (once on this machine, about half a minute) ..."):
-        pose = approach_pose(0)
-        corners = project(CAMERA, pose, RUNWAY.corners)
-        estimate_pose(GaussianKeypoints.from_sigma(corners, 1.0), RUNWAY.corners, CAMERA)
+        camera, runway, pose = Camera(8, 8, 10, 10, 3.5, 3.5), Runway(1500, 45), Pose.from_attitude([-900, 0, 60])
+        corners = project(camera, pose, runway.corners)
+        estimate_pose(GaussianKeypoints.from_sigma(corners, 1.0), runway.corners, camera)
         if scenes:
-            render(demo_scene(), CAMERA.view(PixelWindow(0, 0, 8, 8, 8, 8)), pose)
+            from shortfinal.data.scene import random_scene, render
+
+            render(random_scene(np.random.default_rng(0), runway), camera, pose)
 
 
 def _sized_runway(size: str, ident: str) -> Any:
@@ -324,9 +327,10 @@ def _demo_table(frames: Iterable[Flown]) -> Table:
     for f in frames:
         estimate, keypoints = f.result.estimate, f.result.keypoints
         cells = ["–"] * 4
-        if estimate is not None and estimate.pose is not None and estimate.cov is not None and f.error_m is not None:
+        sigma_m = None if estimate is None else estimate.sigma_position_m
+        if estimate is not None and estimate.pose is not None and sigma_m is not None and f.error_m is not None:
             x, _, z = estimate.pose.position_m
-            sx, _, sz = 2 * estimate.cov.diagonal()[:3] ** 0.5
+            sx, _, sz = 2 * sigma_m
             along, _, vertical = f.error_m
             cells = [f"{-x:.0f} ±{sx:.0f}", f"{z:.0f} ±{sz:.1f}", f"{along:+.1f}", f"{vertical:+.1f}"]
         sigma = "–" if keypoints is None else f"{keypoints.sigma_px.mean():.2f}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from shortfinal.geometry import Camera, Pose, project
 from shortfinal.integrity import Decision
 from shortfinal.keypoints import GaussianKeypoints
 from shortfinal.pipeline import FrameResult, LandingPipeline
-from shortfinal.pose import PoseEstimate, estimate_pose
+from shortfinal.pose import PoseEstimate
 from shortfinal.runway import Runway
 from shortfinal.stream.overlay import Notes, contact_sheet, draw_result
 from shortfinal.stream.sink import JsonlWriter, VideoWriter
@@ -119,16 +119,13 @@ def inject(fault: Fault, truth: Pose) -> Callable[[GaussianKeypoints], GaussianK
     return lambda keypoints: GaussianKeypoints(keypoints.mean_px + shift, keypoints.cov_px)
 
 
-def _spoil(
-    fault: Fault, truth: Pose, found: list[GaussianKeypoints]
-) -> Callable[[GaussianKeypoints], GaussianKeypoints]:
-    """The fault, keeping in `found` the keypoints as they were."""
-
-    def spoil(keypoints: GaussianKeypoints) -> GaussianKeypoints:
-        found.append(keypoints)
-        return inject(fault, truth)(keypoints)
-
-    return spoil
+def _with_fault(pipeline: LandingPipeline, sound: FrameResult, fault: Fault, truth: Pose) -> FrameResult:
+    """The frame as it would have been judged with the fault."""
+    if fault is Fault.NONE or sound.keypoints is None or sound.estimate is None:
+        return sound
+    keypoints = inject(fault, truth)(sound.keypoints)
+    estimate, verdict = pipeline.judge(keypoints)
+    return replace(sound, keypoints=keypoints, estimate=estimate, verdict=verdict)
 
 
 def fly(detector: KeypointDetector) -> Iterator[tuple[Flown, Image]]:
@@ -147,10 +144,9 @@ def fly(detector: KeypointDetector) -> Iterator[tuple[Flown, Image]]:
             ahead[number] = Future()  # let go of the picture
             prior = truth.plus(rng.normal(0, [8, 4, 4, 0.003, 0.003, 0.003]))
             timestamp = number / (FRAMES - 1) * (START_M - END_M) / SPEED_M_S
-            found: list[GaussianKeypoints] = []
-            result = pipeline.step(image, timestamp, prior=prior, alter=_spoil(fault, truth, found))
-            sound = estimate_pose(found[0], RUNWAY.corners, CAMERA) if found else None
-            yield Flown(number, fault, truth, result, sound), image
+            sound = pipeline.step(image, timestamp, prior=prior)
+            result = _with_fault(pipeline, sound, fault, truth)
+            yield Flown(number, fault, truth, result, sound.estimate), image
 
 
 def run_demo(
@@ -235,6 +231,5 @@ def _draw_timeline(flown: list[Flown], path: Path) -> None:
 
 def _sigma(frame: Flown) -> Array:
     estimate = frame.result.estimate
-    if estimate is None or estimate.cov is None:
-        return np.full(3, np.nan)
-    return np.asarray(np.sqrt(np.diag(estimate.cov)[:3]))
+    sigma = None if estimate is None else estimate.sigma_position_m
+    return np.full(3, np.nan) if sigma is None else sigma

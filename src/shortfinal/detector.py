@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass, fields
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -168,7 +167,6 @@ def normalise(crop: Image, mean: tuple[float, ...], std: tuple[float, ...]) -> N
     return np.ascontiguousarray(scaled.transpose(2, 0, 1))
 
 
-@cache
 def shipped_model() -> Path:
     """The model file inside the package."""
     return Path(str(files("shortfinal") / "models" / "runway.onnx"))

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import json
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +42,25 @@ def write_png(path: str | Path, picture: NDArray[np.uint8]) -> None:
     import cv2
 
     write_whole(path, bytes(cv2.imencode(".png", picture[..., ::-1])[1]))
+
+
+def read_json(path: str | Path, what: str) -> Any:
+    """The content of a JSON file; a byte-order mark is let pass. Raises InputError naming the file and `what` it is."""
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the {what}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a JSON file: {error}") from error
+
+
+def csv_text(columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """A table with a header line, as text for `write_whole`."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def make_folder(path: str | Path) -> Path:

@@ -88,11 +88,13 @@ class PixelWindow:
         """Output pixels (..., 2) to source pixels (..., 2)."""
         return (np.asarray(px, float) + 0.5) / self.scale + [self.left, self.top] - 0.5
 
+    def apply_cov(self, cov_px: ArrayLike) -> Array:
+        """Covariance of K keypoints (2K, 2K) in source pixels, as one in output pixels."""
+        return _scaled_cov(cov_px, self.scale)
+
     def inverse_cov(self, cov_px: ArrayLike) -> Array:
         """Covariance of K keypoints (2K, 2K) in output pixels, as one in source pixels."""
-        cov = np.asarray(cov_px, float)
-        unscale = np.tile(1.0 / self.scale, cov.shape[0] // 2)
-        return cov * np.outer(unscale, unscale)
+        return _scaled_cov(cov_px, 1.0 / self.scale)
 
 
 @dataclass(frozen=True)
@@ -243,6 +245,12 @@ def unproject(camera: Camera, px: ArrayLike) -> Array:
             raise InputError(f"px: pixel {k} ({u:.1f}, {v:.1f}) is outside the range of the camera's distortion")
         rays[k, :2] = x, y
     return rays
+
+
+def _scaled_cov(cov_px: ArrayLike, scale: Array) -> Array:
+    cov = np.asarray(cov_px, float)
+    each = np.tile(scale, cov.shape[0] // 2)
+    return cov * np.outer(each, each)
 
 
 def so3_exp(rotation_vector: ArrayLike) -> Array:

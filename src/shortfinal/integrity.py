@@ -73,7 +73,7 @@ def check_integrity(est: PoseEstimate, false_alarm_rate: float = FALSE_ALARM_RAT
     the solver converged, redundancy is left, and the pose is known well enough for a linear test.
     Raises InputError for a rate outside (0, 1).
     """
-    _check_rate(false_alarm_rate, "false_alarm_rate")
+    check_rate(false_alarm_rate, "false_alarm_rate")
     obstacle = _obstacle(est)
     if obstacle:
         return IntegrityVerdict(Decision.NOT_MONITORED, (obstacle,), est.dof, false_alarm_rate)
@@ -92,7 +92,7 @@ def check_integrity(est: PoseEstimate, false_alarm_rate: float = FALSE_ALARM_RAT
 
 def check_integrity_batch(batch: PoseEstimateBatch, false_alarm_rate: float = FALSE_ALARM_RATE) -> IntegrityBatch:
     """`check_integrity` of N estimates, as arrays. Raises InputError for a rate outside (0, 1)."""
-    _check_rate(false_alarm_rate, "false_alarm_rate")
+    check_rate(false_alarm_rate, "false_alarm_rate")
     monitored = batch.converged & np.isfinite(batch.chi2) & (batch.dof > 0)
     variances = np.diagonal(batch.cov_px, axis1=1, axis2=2)
     monitored &= _redundant(batch.mean_px, variances) & _first_order(batch.positions, batch.covs, batch.points)
@@ -144,7 +144,7 @@ def detection_probability(est: PoseEstimate, bias_px: ArrayLike, false_alarm_rat
     bias. A shift that a change of pose explains has λ = 0: it is never detected. Raises InputError
     for a rate outside (0, 1), or where the estimate is not monitored.
     """
-    _check_rate(false_alarm_rate, "false_alarm_rate")
+    check_rate(false_alarm_rate, "false_alarm_rate")
     threshold = float(chdtri(_solved(est).dof, false_alarm_rate))
     from scipy.stats import ncx2  # its survival function does not saturate; slow to import
 
@@ -164,7 +164,7 @@ def minimal_detectable_bias(
 
     Raises InputError as `detection_probability`, and unless false_alarm_rate < power < 1.
     """
-    _check_rate(false_alarm_rate, "false_alarm_rate")
+    check_rate(false_alarm_rate, "false_alarm_rate")
     if not false_alarm_rate < power < 1:
         raise InputError(f"power: {power} must lie between the false-alarm rate {false_alarm_rate} and 1")
     threshold = float(chdtri(_solved(est).dof, false_alarm_rate))
@@ -177,7 +177,8 @@ def minimal_detectable_bias(
     return math.sqrt(needed / unit) if unit > 1e-20 * total else math.inf
 
 
-def _check_rate(rate: float, name: str) -> None:
+def check_rate(rate: float, name: str) -> None:
+    """Raises InputError unless `rate` is a number between 0 and 1."""
     if not (isinstance(rate, (int, float)) and 0 < rate < 1):
         raise InputError(f"{name}: {rate} is no probability; it must lie between 0 and 1, e.g. {FALSE_ALARM_RATE}")
 

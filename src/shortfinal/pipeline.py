@@ -15,7 +15,7 @@ from shortfinal.crops import box_around, centre_crop
 from shortfinal.detector import Image, KeypointDetector, check_image, crop_image
 from shortfinal.errors import InputError
 from shortfinal.geometry import Camera, PixelWindow, Pose, as_array, project
-from shortfinal.integrity import Decision, IntegrityVerdict, check_integrity
+from shortfinal.integrity import FALSE_ALARM_RATE, Decision, IntegrityVerdict, check_integrity, check_rate
 from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
 from shortfinal.pose import PoseEstimate, estimate_pose
 from shortfinal.runway import Runway
@@ -72,15 +72,14 @@ class LandingPipeline:
     """
 
     def __init__(
-        self, detector: KeypointDetector, runway: Runway, camera: Camera, *, false_alarm_rate: float = 1e-3
+        self, detector: KeypointDetector, runway: Runway, camera: Camera, *, false_alarm_rate: float = FALSE_ALARM_RATE
     ) -> None:
         """Raises InputError for a rate outside (0, 1) or a model whose keypoints are not the four corners."""
         if detector.info.keypoints != CORNER_NAMES:
             raise InputError(
                 f"detector: its keypoints are {', '.join(detector.info.keypoints)}; expected {', '.join(CORNER_NAMES)}"
             )
-        if not (isinstance(false_alarm_rate, (int, float)) and 0 < false_alarm_rate < 1):
-            raise InputError(f"false_alarm_rate: {false_alarm_rate!r}; it must lie between 0 and 1")
+        check_rate(false_alarm_rate, "false_alarm_rate")
         self.detector, self.runway, self.camera = detector, runway, camera
         self.false_alarm_rate = false_alarm_rate
         self._last: Pose | None = None
@@ -92,14 +91,13 @@ class LandingPipeline:
         *,
         box: ArrayLike | None = None,
         prior: Pose | None = None,
-        alter: Callable[[GaussianKeypoints], GaussianKeypoints] | None = None,
     ) -> FrameResult:
         """Process one frame (height, width, 3; RGB, uint8).
 
         `box` (4,): left, top, right, bottom in pixels; `prior`: a pose near enough for a crop
-        twice the runway's size to see most of it. `alter` changes the keypoints before they are used: for injecting
-        faults. Raises InputError for a frame of another size or type or a timestamp that is not
-        finite; whatever fails after that is a verdict of NOT_MONITORED with its reason.
+        twice the runway's size to see most of it. Raises InputError for a frame of another size or
+        type or a timestamp that is not finite; whatever fails after that is a verdict of
+        NOT_MONITORED with its reason.
         """
         check_image(frame_rgb)
         if frame_rgb.shape[:2] != (self.camera.height, self.camera.width):
@@ -116,7 +114,6 @@ class LandingPipeline:
             return FrameResult(timestamp_s, None, None, None, self._not_monitored(str(error)), timings)
         if obstacle:
             return FrameResult(timestamp_s, crop, keypoints, None, self._not_monitored(obstacle), timings)
-        keypoints = alter(keypoints) if alter else keypoints
         estimate, verdict = self.judge(keypoints, timings)
         return FrameResult(timestamp_s, crop, keypoints, estimate, verdict, timings)
 

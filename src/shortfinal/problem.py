@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shortfinal.errors import InputError
+from shortfinal.files import read_json
 from shortfinal.geometry import Camera, as_array
 from shortfinal.keypoints import GaussianKeypoints
 from shortfinal.pose import PoseEstimate, estimate_pose
@@ -41,12 +41,7 @@ def read_problem(path: str | Path) -> PoseProblem:
     "sigma_px": one number or K x 2, or "cov_px": 2K x 2K, "points_m": K x 3, or "runway":
     {"length_m", "width_m"}}. Raises InputError naming the file and the field.
     """
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the problem: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not a JSON file: {error}") from error
+    content = read_json(path, "problem")
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a JSON object with camera, keypoints_px, sigma_px and runway")
     try:

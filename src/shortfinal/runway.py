@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shortfinal.errors import InputError
+from shortfinal.files import read_json
 from shortfinal.geometry import as_array
 
 Array = NDArray[np.float64]
@@ -102,12 +102,7 @@ def find_runway(ident: str, database: str | Path | None = None) -> Runway:
 
 def load_database(path: str | Path) -> dict[str, Any]:
     """The database file as it is: {airport: {direction: {A, B, C, D: ...}}}. Raises InputError."""
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the runway database: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not a JSON runway database: {error}") from error
+    content = read_json(path, "runway database")
     if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
         raise InputError(f"{path}: expected {{airport: {{direction: corners}}}} as in LARD's database")
     return content

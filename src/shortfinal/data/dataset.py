@@ -6,8 +6,6 @@ seed and its number alone, so an interrupted run continues where it stopped.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 from collections.abc import Callable
@@ -20,9 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shortfinal.crops import bogo_crop, box_around
+from shortfinal.data.lard import NAUTICAL_MILE_M
 from shortfinal.data.scene import Scene, Sensor, random_scene, random_sensor, render
+from shortfinal.data.table import read_table
 from shortfinal.errors import InputError
-from shortfinal.files import make_folder, write_png, write_whole
+from shortfinal.files import csv_text, make_folder, write_png, write_whole
 from shortfinal.geometry import Camera, Pose, project
 from shortfinal.runway import Runway
 
@@ -36,7 +36,6 @@ COLUMNS = (
     "far_right_u", "far_right_v", "far_left_u", "far_left_v",
 )  # fmt: skip
 _CORNER_COLUMNS = COLUMNS[-8:]
-NAUTICAL_MILE_M = 1852.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,11 +135,7 @@ def write_dataset(
 
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         rows = list(pool.map(one, range(count)))
-    table = io.StringIO()
-    writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_whole(folder / "labels.csv", table.getvalue())
+    write_whole(folder / "labels.csv", csv_text(COLUMNS, rows))
     return folder / "labels.csv"
 
 
@@ -189,39 +184,19 @@ def read_dataset(folder: str | Path) -> RenderedDataset:
     Raises InputError naming the file, the line and the field, or the first picture that is missing.
     """
     path = Path(folder) / "labels.csv"
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot read the labels: {error.strerror}; `shortfinal data render` writes them"
-        ) from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: not a text file of labels: {error}") from error
-    if not rows:
-        raise InputError(f"{path}: no rows")
-    missing = [c for c in ("image", *_CORNER_COLUMNS) if c not in rows[0]]
+    table = read_table(path)
+    if not table.records:
+        raise InputError(f"{path}: no rows; `shortfinal data render` writes them")
+    missing = [c for c in ("image", *_CORNER_COLUMNS) if c not in table.columns]
     if missing:
         raise InputError(f"{path}: lacks the columns {', '.join(missing)}")
-    corners = np.empty((len(rows), 8))
-    for number, row in enumerate(rows):
-        for column, name in enumerate(_CORNER_COLUMNS):
-            corners[number, column] = _number(path, number + 2, name, row[name])
-    names = [row["image"] or "" for row in rows]
-    for number, name in enumerate(names):
-        if not os.path.isfile(os.path.join(path.parent, name)):
-            raise InputError(f"{path}: line {number + 2}: {path.parent / name}: no such image")
-    return RenderedDataset(path.parent, names, corners.reshape(-1, 4, 2))
-
-
-def _number(path: Path, line: int, field: str, text: str) -> float:
-    try:
-        value = float(text)
-    except (TypeError, ValueError):
-        value = float("nan")
-    if not np.isfinite(value):
-        raise InputError(f"{path}: line {line}: {field} is {text!r}; it must be a finite number")
-    return value
+    rows = list(table.rows())
+    corners = np.array([[row.number(name) for name in _CORNER_COLUMNS] for row in rows]).reshape(-1, 4, 2)
+    for row in rows:
+        picture = os.path.join(path.parent, row.get("image"))
+        if not os.path.isfile(picture):
+            raise InputError(f"{path}: line {row.line}: {picture}: no such image")
+    return RenderedDataset(path.parent, [row.get("image") for row in rows], corners)
 
 
 def read_image(path: str | Path) -> Image:

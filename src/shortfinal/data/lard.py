@@ -12,18 +12,17 @@ half-pixel bias, and the error is uniform within half a pixel.
 
 from __future__ import annotations
 
-import csv
 import difflib
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shortfinal.data.table import Row, Table, read_table
 from shortfinal.errors import InputError
 from shortfinal.geometry import Camera
 
@@ -33,9 +32,9 @@ Array = NDArray[np.float64]
 EARTH_STUDIO = Camera(2448, 2648, 3401.6, 3401.6, 1223.5, 1323.5)
 WHOLE_PIXEL_SIGMA = 1 / math.sqrt(12.0)  # px: of an error uniform within half a pixel
 
-_NAUTICAL_MILE_M = 1852.0
-_V1_DISTANCE_STEP_M = 0.01 * _NAUTICAL_MILE_M  # to which v1 rounds, before the test set's kilometres too
-_DISTANCE_UNITS_M = {"slant_distance": _NAUTICAL_MILE_M, "slant_distance_km": 1000.0}
+NAUTICAL_MILE_M = 1852.0
+_V1_DISTANCE_STEP_M = 0.01 * NAUTICAL_MILE_M  # to which v1 rounds, before the test set's kilometres too
+_DISTANCE_UNITS_M = {"slant_distance": NAUTICAL_MILE_M, "slant_distance_km": 1000.0}
 
 _PLACE = ("image", "airport", "runway")
 _READING_ORDER = tuple("ABCD")
@@ -65,44 +64,21 @@ def read_labels(path: str | Path, camera: Camera | None = None) -> list[RunwayLa
     so a swap stays visible; A to D, which name none, are sorted into left and right here. Raises
     InputError, naming file, line and field, for anything that is not such a file.
     """
-    records = list(_records(path))
-    if not records:
-        raise InputError(f"{path}: empty; expected LARD labels with a header line")
-    columns = records[0].cells
-    _check_columns(path, columns)
-    if len(records) == 1:
-        raise InputError(f"{path}: line 1: a header without rows; expected one label per line")
-    return [_label(_Row(path, record.line, columns, record.cells), camera) for record in records[1:]]
+    return labels_of(read_table(path), camera)
 
 
-@dataclass(frozen=True)
-class _Record:
-    line: int
-    cells: tuple[str, ...]
-
-
-def _records(path: str | Path) -> Iterator[_Record]:
-    """The lines that are not blank, cut into cells."""
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            head = file.readline()
-            file.seek(0)
-            reader = csv.reader(file, delimiter=";" if ";" in head else ",")
-            for cells in reader:
-                stripped = tuple(cell.strip() for cell in cells)
-                if any(stripped):
-                    yield _Record(reader.line_num, stripped)
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the labels: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: not a text file of labels: {error}") from error
+def labels_of(table: Table, camera: Camera | None = None) -> list[RunwayLabel]:
+    """`read_labels` of a table that has been read."""
+    if not table.columns:
+        raise InputError(f"{table.path}: empty; expected LARD labels with a header line")
+    _check_columns(table.path, table.columns)
+    if not table.records:
+        raise InputError(f"{table.path}: line 1: a header without rows; expected one label per line")
+    return [_label(row, camera) for row in table.rows()]
 
 
 def _check_columns(path: str | Path, columns: Sequence[str]) -> None:
-    """Refuse a header without a picture, a runway and four corners, or with a column twice."""
-    twice = {name for name in columns if columns.count(name) > 1}
-    if twice:
-        raise InputError(f"{path}: line 1: column {min(twice)!r} stands there twice; keep one")
+    """Refuse a header without a picture, a runway and four corners."""
     layouts = [_PLACE + _coordinates(corners) for corners in (_NAMED, _READING_ORDER)]
     missing = min(([name for name in layout if name not in columns] for layout in layouts), key=len)
     if missing:
@@ -118,46 +94,7 @@ def _coordinates(corners: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{axis}_{corner}" for corner in corners for axis in "xy")
 
 
-@dataclass(frozen=True)
-class _Row:
-    """One line under the header; cells by column name, refused by file, line and column."""
-
-    path: str | Path
-    line: int
-    columns: tuple[str, ...]
-    cells: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        if len(self.cells) != len(self.columns):
-            raise InputError(
-                f"{self.path}: line {self.line}: {len(self.cells)} cells under {len(self.columns)} columns; "
-                "complete the line or remove it"
-            )
-
-    def get(self, column: str) -> str:
-        """The cell, or nothing if there is no such column."""
-        return self.cells[self.columns.index(column)] if column in self.columns else ""
-
-    def text(self, column: str) -> str:
-        return self.get(column) or self.refuse(column, "expected a name")
-
-    def number(self, column: str, low: float = -math.inf, high: float = math.inf) -> float:
-        """A finite number from `low` to `high`."""
-        try:
-            value = float(self.get(column))
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            self.refuse(column, "expected a finite number")
-        if not low <= value <= high:
-            self.refuse(column, f"expected {low:g} to {high:g}")
-        return value
-
-    def refuse(self, column: str, mend: str) -> NoReturn:
-        raise InputError(f"{self.path}: line {self.line}: {column} is {self.get(column)!r}; {mend}")
-
-
-def _label(row: _Row, given: Camera | None) -> RunwayLabel:
+def _label(row: Row, given: Camera | None) -> RunwayLabel:
     camera = given or _own_camera(row)
     corners, in_order = _corners(row, camera)
     return RunwayLabel(
@@ -173,12 +110,12 @@ def _label(row: _Row, given: Camera | None) -> RunwayLabel:
     )
 
 
-def _own_camera(row: _Row) -> Camera | None:
+def _own_camera(row: Row) -> Camera | None:
     """Earth Studio's, for v1 rows of its images; `height` and `width` say 1024 there, wrongly."""
     return EARTH_STUDIO if _is_v1(row) and row.get("type") in ("", "earth_studio") else None
 
 
-def _is_v1(row: _Row) -> bool:
+def _is_v1(row: Row) -> bool:
     return "x_A" in row.columns
 
 
@@ -189,14 +126,14 @@ def _ident(airport: str, runway: str) -> str:
     return f"{airport}/{padding}{runway}".upper()
 
 
-def _distance(row: _Row) -> float | None:
+def _distance(row: Row) -> float | None:
     for column, unit_m in _DISTANCE_UNITS_M.items():
         if row.get(column):
             return unit_m * row.number(column, low=0.0)
     return None
 
 
-def _corners(row: _Row, camera: Camera | None) -> tuple[Array, bool]:
+def _corners(row: Row, camera: Camera | None) -> tuple[Array, bool]:
     """Corners (4, 2) in keypoint order, and whether their columns were in the order promised."""
     names = _NAMED if "x_TL" in row.columns else _READING_ORDER
     # LARD keeps runways that stick out of the picture; a corner a whole picture away is a mistake.

@@ -35,6 +35,7 @@ _PAPER: Colour = (16, 20, 27)
 _INK: Colour = (232, 236, 242)
 _DIM: Colour = (142, 152, 166)
 _AMBER: Colour = (255, 196, 84)
+_ELLIPSE: Colour = (255, 236, 110)
 _SHIFT = 4  # OpenCV draws at 1/16 px
 
 
@@ -63,18 +64,14 @@ def draw_result(frame: Image, result: FrameResult, notes: Notes) -> Image:
     return _draw_text(canvas, result, notes)
 
 
-def draw_keypoints(view: Image, result: FrameResult, window: PixelWindow, thickness: int = 1) -> None:
+def draw_keypoints(view: Image, result: FrameResult, window: PixelWindow) -> None:
     """Outline and 2-sigma ellipses, drawn in place into a view of the frame through `window`."""
     if result.keypoints is None:
         return
-    colour = COLOURS[result.verdict.decision]
     means = window.apply(result.keypoints.mean_px)
-    fixed = np.round(means * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)
-    cv2.polylines(view, [fixed], True, colour, thickness, cv2.LINE_AA, _SHIFT)
+    _draw_outline(view, means, COLOURS[result.verdict.decision])
     for k, mean in enumerate(means):
-        outline = ellipse(mean, _scaled(result.keypoints.block(k), window), 2.0)
-        cv2.polylines(view, [np.round(outline * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)], True, (255, 236, 110),
-                      thickness, cv2.LINE_AA, _SHIFT)  # fmt: skip
+        _draw_outline(view, ellipse(mean, window.apply_cov(result.keypoints.block(k)), 2.0), _ELLIPSE)
 
 
 def ellipse(mean: ArrayLike, cov: ArrayLike, sigmas: float, points: int = 48) -> Array:
@@ -119,8 +116,9 @@ def write_labelled(picture: Image, text: str, colour: Colour = _INK, size: int =
     return np.asarray(image, np.uint8)
 
 
-def _scaled(cov: Array, window: PixelWindow) -> Array:
-    return cov * np.outer(window.scale, window.scale)
+def _draw_outline(view: Image, points: Array, colour: Colour) -> None:
+    fixed = np.round(points * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)
+    cv2.polylines(view, [fixed], True, colour, 1, cv2.LINE_AA, _SHIFT)
 
 
 def _seen(frame: Image, result: FrameResult, crop: PixelWindow, size: int) -> tuple[Image, PixelWindow]:
@@ -159,8 +157,9 @@ def _figures(result: FrameResult, notes: Notes) -> list[tuple[str, str, str]]:
     """(name, value with its 2 sigma, true error) for the panel."""
     lines = []
     estimate = result.estimate
-    if estimate is not None and estimate.pose is not None and estimate.cov is not None:
-        position, sigma = estimate.pose.position_m, np.sqrt(np.diag(estimate.cov))
+    sigma = None if estimate is None else estimate.sigma_position_m
+    if estimate is not None and estimate.pose is not None and sigma is not None:
+        position = estimate.pose.position_m
         named = (("distance", 0, -1.0), ("left", 1, 1.0), ("height", 2, 1.0))
         for name, axis, sign in named:
             value = f"{sign * position[axis]:.1f} ± {2 * sigma[axis]:.1f} m"

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from shortfinal.crops import box_around
 from shortfinal.data.dataset import read_image
-from shortfinal.data.lard import _records, read_labels
-from shortfinal.data.lard import _Row as _Cells
+from shortfinal.data.lard import labels_of
+from shortfinal.data.table import Row, read_table
 from shortfinal.errors import InputError
 from shortfinal.geometry import Camera, PixelWindow
 from shortfinal.runway import Runway, find_in_database, load_database
@@ -72,16 +72,13 @@ class LabelledFolder:
         return (row.frame() for row in self._rows)
 
     def _read(self) -> list[_Row]:
-        records = list(_records(self.labels))
-        if records and set(_BOX) <= set(columns := records[0].cells):
-            twice = [name for name in columns if columns.count(name) > 1]
-            if twice:
-                raise InputError(f"{self.labels}: line 1: column {twice[0]!r} stands there twice; keep one")
-            if len(records) == 1:
+        table = read_table(self.labels)
+        if set(_BOX) <= set(table.columns):
+            if not table.records:
                 raise InputError(f"{self.labels}: a header without rows; expected one box per line")
-            return [self._boxed(_Cells(self.labels, record.line, columns, record.cells)) for record in records[1:]]
+            return [self._boxed(row) for row in table.rows()]
         rows = []
-        for label in read_labels(self.labels):
+        for label in labels_of(table):
             where = f"{self.labels}: line {label.line}"
             if self._camera is None and label.camera is None:
                 raise InputError(f"{where}: these labels do not say which camera took the picture; pass --camera")
@@ -98,7 +95,7 @@ class LabelledFolder:
             )
         return rows
 
-    def _boxed(self, cells: _Cells) -> _Row:
+    def _boxed(self, cells: Row) -> _Row:
         where = f"{self.labels}: line {cells.line}"
         if self._camera is None:
             raise InputError(f"{where}: a box file does not say which camera took the picture; pass --camera")

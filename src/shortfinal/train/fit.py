@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 from collections.abc import Iterable
@@ -21,11 +20,12 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.data import DataLoader, Dataset
 
+from shortfinal.calibration import coverage
 from shortfinal.crops import bogo_crop, box_around, centre_crop
 from shortfinal.data.dataset import Example, read_dataset
 from shortfinal.detector import crop_image, normalise
 from shortfinal.errors import InputError, JobError
-from shortfinal.files import make_folder, write_whole
+from shortfinal.files import csv_text, make_folder, write_whole
 from shortfinal.geometry import PixelWindow
 from shortfinal.train.model import KeypointNet, gaussian_nll, to_pixels, variance_px
 
@@ -141,15 +141,15 @@ def validate(model: torch.nn.Module, batches: Iterable[Batch], size: int) -> dic
             variances.append(variance_px(log_variance))
     error, sigma = torch.cat(errors), torch.cat(variances).sqrt()
     size_of = error.abs()
-    ratio = size_of / sigma
+    covered = coverage(error.cpu().numpy(), sigma.cpu().numpy(), (0.68, 0.95))
     return {
-        "nll": float((0.5 * ratio.square() + sigma.log()).mean()),
+        "nll": float((0.5 * (error / sigma).square() + sigma.log()).mean()),
         "median_px": float(size_of.median()),
         "p90_px": float(size_of.flatten().quantile(0.9)),
         "mean_px": float(size_of.mean()),
         "far_median_px": float(size_of[:, 2:].median()),
-        "coverage_68": float((ratio < 0.99446).float().mean()),  # normal quantiles of 68 and 95 %
-        "coverage_95": float((ratio < 1.95996).float().mean()),
+        "coverage_68": float(covered[0]),
+        "coverage_95": float(covered[1]),
     }
 
 
@@ -205,7 +205,8 @@ class Run:
             loss = 0.1 * error.abs().mean() + gaussian_nll(error.detach(), log_variance)
         else:
             loss = gaussian_nll(error, log_variance)
-        if not math.isfinite(float(loss.detach())):
+        value = float(loss.detach())
+        if not math.isfinite(value):
             raise JobError(f"diverged at step {self.step + 1}; lower --learning-rate")
         self.optimizer.zero_grad(set_to_none=True)
         self.fabric.backward(loss)
@@ -214,7 +215,7 @@ class Run:
         self.schedule.step()
         self.average.update_parameters(self.net)
         self.step += 1
-        return float(loss.detach())
+        return value
 
     def record(self, figures: dict[str, float]) -> None:
         """Keep a validation: last.pt always, best.pt if it is the best yet, and the table of all."""
@@ -222,11 +223,7 @@ class Run:
         self.history.append(figures)
         if figures["nll"] < best:
             self.save("best.pt")
-        table = io.StringIO()
-        writer = csv.DictWriter(table, figures.keys(), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self.history)
-        write_whole(self.folder / "log.csv", table.getvalue())
+        write_whole(self.folder / "log.csv", csv_text(figures, self.history))
         self.save("last.pt")  # last of all: what is lost by a kill before it is done again, not twice
 
 
