@@ -14,6 +14,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,7 +31,7 @@ from shortfinal.geometry import (
     normalise_kernel,
     project_kernel,
 )
-from shortfinal.keypoints import GaussianKeypoints
+from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
 
 Array = NDArray[np.float64]
 
@@ -57,6 +58,13 @@ STATUS_OF_CODE = tuple(SolverStatus)
 _CONVERGED, _AMBIGUOUS, _ILL_CONDITIONED, _BEHIND_CAMERA, _MAX_ITERATIONS, _NON_FINITE = range(len(STATUS_OF_CODE))
 
 
+class Feature(NamedTuple):
+    """One thing measured: its name, and its rows in the residual, the Jacobian and the factor."""
+
+    name: str
+    rows: slice
+
+
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
     """A pose, how sure it is, and what is left over.
@@ -80,6 +88,16 @@ class PoseEstimate:
     def dof(self) -> int:
         """Degrees of freedom left for checking: 2K - 6."""
         return len(self.residual) - 6
+
+    @cached_property
+    def features(self) -> tuple[Feature, ...]:
+        """What was measured, in the order of the rows."""
+        return keypoint_features(len(self.points))
+
+    @cached_property
+    def factor(self) -> Array:
+        """L (n, n), the Cholesky factor of the covariance of all rows: whitening divides by it."""
+        return np.asarray(np.linalg.cholesky(self.keypoints.cov_px))
 
     @property
     def sigma_position_m(self) -> Array | None:
@@ -252,6 +270,12 @@ class _Planar(NamedTuple):
     turn: Any  # (3, 3)
     tilt: Any  # (3, 3)
     camera_from_plane: Any  # (3, 3)
+
+
+def keypoint_features(count: int) -> tuple[Feature, ...]:
+    """The features of `count` keypoints: the corners by name, further ones by number."""
+    names = [*CORNER_NAMES, *(f"point {k}" for k in range(len(CORNER_NAMES), count))][:count]
+    return tuple(Feature(name, slice(2 * k, 2 * k + 2)) for k, name in enumerate(names))
 
 
 def _check_counts(keypoints: int, points: int) -> None:
