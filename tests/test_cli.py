@@ -94,6 +94,41 @@ def test_solve(tmp_path, capsys):
     assert call(capsys, "solve", problem_file(tmp_path))[0] == 0
 
 
+def test_three_corners_are_solved_but_not_monitored(tmp_path, capsys):
+    changes = {"keypoints_px": CORNERS[:3].tolist(), "points_m": RUNWAY.corners[:3].tolist()}
+    status, out, _ = call(capsys, "solve", problem_file(tmp_path, **changes), "--json")
+    assert status == 0
+    assert json.loads(out)["decision"] == "not-monitored"
+
+
+POSE = approach_pose(60)
+# What the other sensors would say of that pose: three rows each for attitude and position, one, and four.
+SENSORS = {
+    "attitude_prior": {**POSE.attitude._asdict(), "sigma_deg": 0.05},
+    "position_prior": {"position_m": POSE.position_m.tolist(), "sigma_m": [5, 2, 2]},
+    "altitude": {"height_m": POSE.position_m[2], "sigma_m": 0.5},
+    "lines": {
+        "rho_px": sf.project_lines(CAMERA, POSE, RUNWAY.edges)[:, 0].tolist(),
+        "theta_deg": np.degrees(sf.project_lines(CAMERA, POSE, RUNWAY.edges)[:, 1]).tolist(),
+        "sigma_px": 0.5,
+        "sigma_deg": 0.1,
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "rows"), [("attitude_prior", 3), ("position_prior", 3), ("altitude", 1), ("lines", 4)]
+)
+def test_solve_with_other_sensors(tmp_path, capsys, name, rows):
+    _, plain, _ = call(capsys, "solve", problem_file(tmp_path), "--json")
+    status, out, _ = call(capsys, "solve", problem_file(tmp_path, **{name: SENSORS[name]}), "--json")
+    record, without = json.loads(out), json.loads(plain)
+    assert status == 0
+    assert record["dof"] == 2 + rows
+    assert record["position_m"] == pytest.approx(POSE.position_m, abs=1e-4)
+    assert np.trace(record["cov"]) < np.trace(without["cov"])
+
+
 COLLINEAR = [[100.0 + 50 * k, 300.0 + 10 * k] for k in range(4)]
 NEGATIVE = np.diag([1.0, 1, 1, -1, 1, 1, 1, 1]).tolist()
 SKEW = (np.eye(8) + np.diag([0.5] * 7, 1)).tolist()
@@ -103,7 +138,7 @@ BEHIND = [[-5000.0, 22.5, 300], [-5000, -22.5, 300], [-7000, -22.5, 300], [-7000
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"keypoints_px": CORNERS[:3].tolist(), "points_m": RUNWAY.corners[:3].tolist()}, "at least four"),
+        ({"keypoints_px": CORNERS[:2].tolist(), "points_m": RUNWAY.corners[:2].tolist()}, "at least three"),
         ({"keypoints_px": COLLINEAR}, "all lie on one line"),
         ({"points_m": [[1000.0 * k, 0, 0] for k in range(4)]}, "no pose"),
         ({"keypoints_px": (CORNERS * [1, -1] + [0, 720]).tolist()}, "no pose"),
@@ -127,6 +162,16 @@ BEHIND = [[-5000.0, 22.5, 300], [-5000, -22.5, 300], [-7000, -22.5, 300], [-7000
         ({"keypoints_px": [[10**400, 1], *CORNERS[1:].tolist()]}, "mean_px: expected numbers"),
         ({"keypoints_px": (CORNERS * 1e150).tolist()}, "no pixel of any camera"),
         ({"runway": {"length_m": 1e300, "width_m": 45}}, "length_m is 1e\\+300"),
+        ({"altitude": {"height_m": 80}}, "altitude: expected an object with height_m, sigma_m"),
+        ({"altitude": {"height_m": 80, "sigma_m": 0}}, "sigma_m is 0"),
+        ({"attitude_prior": SENSORS["attitude_prior"] | {"sigma_deg": [0.1, 0.1, -0.0]}}, "attitude_prior"),
+        ({"attitude_prior": SENSORS["attitude_prior"] | {"sigma_deg": [0.1, 0.1]}}, "attitude_prior: sigma"),
+        (
+            {"position_prior": SENSORS["position_prior"], "altitude": {"height_m": 900, "sigma_m": 1}},
+            "contradict|apart",
+        ),
+        ({"lines": SENSORS["lines"] | {"theta_deg": [1.0]}}, "2 rho_px for 1 theta_deg"),
+        ({"lines": SENSORS["lines"] | {"slope": 1}}, "lines: expected an object"),
     ],
 )
 def test_problems_that_are_none(tmp_path, capsys, changes, message):

@@ -77,7 +77,7 @@ def test_without_a_box_it_looks_where_the_last_accepted_frame_was(frame):
 
 def test_a_slid_corner_is_refused(pipeline, frame):
     found = pipeline.step(frame, box=BOX).keypoints
-    _, verdict = pipeline.judge(inject(Fault.NEAR_CORNER, TRUTH)(found))
+    _, verdict, _ = pipeline.judge(inject(Fault.NEAR_CORNER, TRUTH)(found))
     assert verdict.decision is Decision.DO_NOT_USE
     assert "do not fit the runway" in verdict.reasons[0]
 

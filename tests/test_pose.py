@@ -193,7 +193,7 @@ def test_an_initial_pose_is_one_more_start():
 @pytest.mark.parametrize(
     ("px", "points", "message"),
     [
-        (np.ones((3, 2)), np.ones((3, 3)), "give at least four"),
+        (np.ones((2, 2)), np.ones((2, 3)), "a pose needs at least three"),
         (np.ones((4, 2)), np.ones((5, 3)), "5 points for 4 keypoints"),
         (np.ones((4, 2)), np.ones((4, 2)), "points: expected shape"),
         (np.ones((4, 2)), np.full((4, 3), np.nan), "points: entry"),
@@ -213,7 +213,7 @@ def test_wrong_input_is_refused_in_one_line(px, points, message):
         ((5, 4, 2), (6, 6), (4, 3), "cov_px"),
         ((5, 4, 2), (3, 8, 8), (4, 3), "cov_px"),
         ((5, 4, 2), (8, 8), (4, 4, 3), "points"),
-        ((5, 3, 2), (6, 6), (3, 3), "at least four"),
+        ((5, 2, 2), (4, 4), (2, 3), "at least three"),
     ],
 )
 def test_wrong_batch_shapes_are_refused(mean, cov, points, name):

@@ -35,6 +35,40 @@ def test_a_flat_runway_in_the_order_of_its_corners():
     np.testing.assert_array_equal(sf.Runway(1500, 60).corners, expected)
 
 
+def test_edges_run_from_the_near_end_to_the_far_one():
+    left, right = sf.Runway(1500, 60).edges
+    np.testing.assert_array_equal(left, [[0, 30, 0], [1500, 30, 0]])
+    np.testing.assert_array_equal(right, [[0, -30, 0], [1500, -30, 0]])
+
+
+@pytest.mark.parametrize(
+    ("length", "width", "begin", "half"),
+    [
+        (3000, 45, 400, 15),
+        (2400, 45, 400, 15),
+        (2399, 45, 300, 15),
+        (1200, 30, 300, 13),  # narrowed: 2 m to the edge
+        (1199, 30, 250, 10.5),
+        (799, 23, 150, 7),
+    ],
+)
+def test_the_aiming_point_stands_where_annex_14_puts_it(length, width, begin, half):
+    expected = [[begin, half, 0], [begin, -half, 0], [begin + 45, -half, 0], [begin + 45, half, 0]]
+    np.testing.assert_allclose(sf.Runway(length, width).aiming_point, expected, atol=1e-9)
+
+
+def test_the_aiming_point_lies_on_a_sloping_runway():
+    corners = [[0, 22.5, 0], [0, -22.5, 1], [2000, -22.5, 21], [2000, 22.5, 20]]
+    marking = sf.Runway(2000, 45, corners=corners).aiming_point
+    np.testing.assert_allclose(marking[:, 2], 0.01 * marking[:, 0] + 0.5 - marking[:, 1] / 45)
+
+
+@pytest.mark.parametrize("size", [(190, 20), (3000, 20), (600, 9)])
+def test_a_runway_too_small_has_no_aiming_point(size):
+    with pytest.raises(sf.InputError, match="no room for an aiming point"):
+        _ = sf.Runway(*size).aiming_point
+
+
 @pytest.mark.parametrize("heading", [0, 57, 183, 300])
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (1, 0, 3, 2), (0, 1, 3, 2)])
 def test_wgs84_corners_come_back_in_metres_whichever_side_was_listed_first(heading, order):

@@ -11,8 +11,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from shortfinal.calibration import coverage, fit_sigma_scale, gaussian_nll, sharpness
     from shortfinal.detector import KeypointDetector, ModelInfo
+    from shortfinal.distribution import PoseSamples, sample_pose
     from shortfinal.errors import InputError
-    from shortfinal.geometry import Attitude, Camera, PixelWindow, Pose, project, project_jacobian, unproject
+    from shortfinal.exclusion import FaultExclusion, exclude_faults
+    from shortfinal.features import Altitude, AttitudePrior, Feature, GaussianLines, PositionPrior
+    from shortfinal.geometry import (
+        Attitude,
+        Camera,
+        PixelWindow,
+        Pose,
+        project,
+        project_jacobian,
+        project_lines,
+        unproject,
+    )
     from shortfinal.integrity import (
         Decision,
         IntegrityVerdict,
@@ -25,13 +37,24 @@ if TYPE_CHECKING:
     from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
     from shortfinal.pipeline import FrameResult, LandingPipeline
     from shortfinal.pose import PoseEstimate, PoseEstimateBatch, SolverStatus, estimate_pose, estimate_pose_batch
+    from shortfinal.protection import AlertLimits, ProtectionLevels, protection_levels, protection_levels_batch
     from shortfinal.runway import Runway, find_runway
+    from shortfinal.window import IntegrityWindow, RelativeMotion, WindowVerdict, check_window
 
 _HOME = {
     "calibration": ("coverage", "fit_sigma_scale", "gaussian_nll", "sharpness"),
     "detector": ("KeypointDetector", "ModelInfo"),
     "errors": ("InputError",),
-    "geometry": ("Attitude", "Camera", "PixelWindow", "Pose", "project", "project_jacobian", "unproject"),
+    "geometry": (
+        "Attitude",
+        "Camera",
+        "PixelWindow",
+        "Pose",
+        "project",
+        "project_jacobian",
+        "project_lines",
+        "unproject",
+    ),
     "integrity": (
         "Decision",
         "IntegrityVerdict",
@@ -45,19 +68,31 @@ _HOME = {
     "pipeline": ("FrameResult", "LandingPipeline"),
     "pose": ("PoseEstimate", "PoseEstimateBatch", "SolverStatus", "estimate_pose", "estimate_pose_batch"),
     "runway": ("Runway", "find_runway"),
+    "exclusion": ("FaultExclusion", "exclude_faults"),
+    "distribution": ("PoseSamples", "sample_pose"),
+    "features": ("Altitude", "AttitudePrior", "Feature", "GaussianLines", "PositionPrior"),
+    "protection": ("AlertLimits", "ProtectionLevels", "protection_levels", "protection_levels_batch"),
+    "window": ("IntegrityWindow", "RelativeMotion", "WindowVerdict", "check_window"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
 __version__ = "0.1.0"
 __all__ = [
     "CORNER_NAMES",
+    "AlertLimits",
+    "Altitude",
     "Attitude",
+    "AttitudePrior",
     "Camera",
     "Decision",
+    "FaultExclusion",
+    "Feature",
     "FrameResult",
     "GaussianKeypoints",
+    "GaussianLines",
     "InputError",
     "IntegrityVerdict",
+    "IntegrityWindow",
     "KeypointDetector",
     "LandingPipeline",
     "ModelInfo",
@@ -65,22 +100,33 @@ __all__ = [
     "Pose",
     "PoseEstimate",
     "PoseEstimateBatch",
+    "PoseSamples",
+    "PositionPrior",
+    "ProtectionLevels",
+    "RelativeMotion",
     "Runway",
     "SolverStatus",
+    "WindowVerdict",
     "__version__",
     "check_integrity",
     "check_integrity_as_published",
     "check_integrity_batch",
+    "check_window",
     "coverage",
     "detection_probability",
     "estimate_pose",
     "estimate_pose_batch",
+    "exclude_faults",
     "find_runway",
     "fit_sigma_scale",
     "gaussian_nll",
     "minimal_detectable_bias",
     "project",
     "project_jacobian",
+    "project_lines",
+    "protection_levels",
+    "protection_levels_batch",
+    "sample_pose",
     "sharpness",
     "unproject",
 ]

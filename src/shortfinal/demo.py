@@ -124,8 +124,8 @@ def _with_fault(pipeline: LandingPipeline, sound: FrameResult, fault: Fault, tru
     if fault is Fault.NONE or sound.keypoints is None or sound.estimate is None:
         return sound
     keypoints = inject(fault, truth)(sound.keypoints)
-    estimate, verdict = pipeline.judge(keypoints)
-    return replace(sound, keypoints=keypoints, estimate=estimate, verdict=verdict)
+    estimate, verdict, protection = pipeline.judge(keypoints)
+    return replace(sound, keypoints=keypoints, estimate=estimate, verdict=verdict, protection=protection)
 
 
 def fly(detector: KeypointDetector) -> Iterator[tuple[Flown, Image]]:

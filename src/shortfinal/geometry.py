@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,6 +21,10 @@ Array = NDArray[np.float64]
 # Columns: the body axes (x forward, y left, z up) seen in the camera's (x right, y down, z forward).
 BODY_FROM_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
+# A compiled function. Without numba's runtime nothing can be allocated in it, which is a promise of
+# the solver's, and no references are counted, which would cost it half of its time.
+kernel: Any = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+
 _DISTORTION_LENGTHS = (0, 4, 5, 8)
 _FOLDED = 1e-6  # Jacobian determinant of the distortion beyond the radius where it is one-to-one
 
@@ -30,7 +35,7 @@ def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> Arra
     Raises InputError naming the argument and, for a non-finite entry, its index.
     """
     try:
-        array = np.array(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError, OverflowError) as error:
         given = " ".join(repr(value).split())
         raise InputError(f"{name}: expected numbers, got {given:.80}") from error
@@ -43,6 +48,17 @@ def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> Arra
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise InputError(f"{name}: entry {list(index)} is {array[index]}; every entry must be finite")
+    return frozen(array)
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotation nearest to `matrix` (3, 3), which rounding has left a little skew: U Vt of its SVD."""
+    u, _, vt = np.linalg.svd(matrix)
+    return frozen(u @ vt)
+
+
+def frozen(array: Array) -> Array:
+    """The same array, no longer to be written to."""
     array.setflags(write=False)
     return array
 
@@ -134,11 +150,11 @@ class Camera:
         """The 3 x 3 intrinsic matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    @property
+    @cached_property
     def intrinsics(self) -> Array:
-        """(fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6): what the kernels take."""
+        """(fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6): what the kernels take; read-only."""
         padding = (0.0,) * (8 - len(self.distortion))
-        return np.array((self.fx, self.fy, self.cx, self.cy, *self.distortion, *padding))
+        return frozen(np.array((self.fx, self.fy, self.cx, self.cy, *self.distortion, *padding)))
 
     def view(self, window: PixelWindow) -> Camera:
         """The camera that would have taken the resampled window directly."""
@@ -175,6 +191,13 @@ class Pose:
             raise InputError(f"runway_from_camera: not a rotation (R Rt - 1 is up to {off:.1e}, or it mirrors)")
         object.__setattr__(self, "position_m", as_array(self.position_m, (3,), "position_m"))
         object.__setattr__(self, "runway_from_camera", rotation)
+
+    @classmethod
+    def trusted(cls, position_m: Array, runway_from_camera: Array) -> Pose:
+        """From arrays that are read-only, and a rotation that is one: the solver's own. Nothing is checked."""
+        pose = object.__new__(cls)
+        pose.__dict__.update(position_m=position_m, runway_from_camera=runway_from_camera)
+        return pose
 
     @classmethod
     def from_attitude(
@@ -230,6 +253,24 @@ def project_jacobian(camera: Camera, pose: Pose, points: ArrayLike) -> Array:
     """
     project(camera, pose, points)
     return _project_all(camera, pose, points)[1]
+
+
+def project_lines(camera: Camera, pose: Pose, edges: ArrayLike) -> Array:
+    """Image lines (L, 2) of straight `edges` (L, 2, 3; both ends, metres, runway frame): rho, theta.
+
+    Normal form u cos(theta) + v sin(theta) = rho, in pixels of the undistorted image and radians;
+    0 <= theta < pi. Either end may lie behind the camera: it is the line through both that is
+    drawn. Raises InputError for an edge that points at the camera, whose image is no line.
+    """
+    ends = as_array(edges, (None, 2, 3), "edges")
+    lines, rotation = np.zeros((len(ends), 2)), np.ascontiguousarray(pose.runway_from_camera)
+    lines_kernel(ends, rotation, pose.position_m, camera.intrinsics, 0, lines.reshape(-1), np.empty((2 * len(ends), 6)))
+    if not np.isfinite(lines).all():
+        k = int(np.argmax(~np.isfinite(lines).all(axis=1)))
+        raise InputError(f"edges: edge {k} points at the camera, or lies in its focal plane: its image is no line")
+    turned = lines[:, 1] < 0.0
+    lines[turned] = lines[turned] * [-1.0, 1.0] + [0.0, np.pi]
+    return lines
 
 
 def unproject(camera: Camera, px: ArrayLike) -> Array:
@@ -288,7 +329,7 @@ def _rotation_z(a: float) -> Array:
 # `project` draws. Scalars and caller-owned arrays only: nothing is allocated per call.
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def distort_kernel(x, y, k):  # type: ignore[no-untyped-def]
     """OpenCV's rational model on normalised (x, y): (xd, yd) and the four entries of its Jacobian."""
     k1, k2, p1, p2, k3, k4, k5, k6 = k[4], k[5], k[6], k[7], k[8], k[9], k[10], k[11]
@@ -306,12 +347,20 @@ def distort_kernel(x, y, k):  # type: ignore[no-untyped-def]
     return xd, yd, xx, xy, xy, yy
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
+def pinhole_kernel(k):  # type: ignore[no-untyped-def]
+    """Whether the lens has no distortion."""
+    return (
+        k[4] == 0.0 and k[5] == 0.0 and k[6] == 0.0 and k[7] == 0.0
+        and k[8] == 0.0 and k[9] == 0.0 and k[10] == 0.0 and k[11] == 0.0
+    )  # fmt: skip
+
+
+@kernel
 def normalise_kernel(u, v, k):  # type: ignore[no-untyped-def]
     """Pixel to undistorted normalised (x, y) by Newton's method, and whether it converged."""
     xd, yd = (u - k[2]) / k[0], (v - k[3]) / k[1]
-    ideal = k[4] == 0.0 and k[5] == 0.0 and k[6] == 0.0 and k[7] == 0.0 and k[8] == 0.0
-    if ideal and k[9] == 0.0 and k[10] == 0.0 and k[11] == 0.0:
+    if pinhole_kernel(k):
         return xd, yd, True
     x, y = xd, yd
     for _ in range(50):
@@ -327,7 +376,7 @@ def normalise_kernel(u, v, k):  # type: ignore[no-untyped-def]
     return x, y, False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def exp_kernel(w, out):  # type: ignore[no-untyped-def]
     """Rodrigues' formula into `out` (3, 3)."""
     x, y, z = w[0], w[1], w[2]
@@ -348,7 +397,58 @@ def exp_kernel(w, out):  # type: ignore[no-untyped-def]
     out[2, 2] = 1.0 - b * (x * x + y * y)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
+def cayley_kernel(w, out):  # type: ignore[no-untyped-def]
+    """A rotation by about the rotation vector `w` (3,), to second order, into `out` (3, 3).
+
+    Cayley's map: the quaternion (1, w/2), normalised. No trigonometry, and no step beyond half a turn.
+    """
+    x, y, z = 0.5 * w[0], 0.5 * w[1], 0.5 * w[2]
+    b = 2.0 / (1.0 + x * x + y * y + z * z)
+    out[0, 0], out[0, 1], out[0, 2] = 1.0 - b * (y * y + z * z), b * (x * y - z), b * (x * z + y)
+    out[1, 0], out[1, 1], out[1, 2] = b * (x * y + z), 1.0 - b * (x * x + z * z), b * (y * z - x)
+    out[2, 0], out[2, 1], out[2, 2] = b * (x * z - y), b * (y * z + x), 1.0 - b * (x * x + y * y)
+
+
+@kernel
+def copy_kernel(source, target):  # type: ignore[no-untyped-def]
+    """Into `target`, number by number; both flat, and not overlapping."""
+    for i in range(source.shape[0]):
+        target[i] = source[i]
+
+
+@kernel
+def product_kernel(a, b, out):  # type: ignore[no-untyped-def]
+    """The product of two matrices (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+@kernel
+def log_kernel(r, w):  # type: ignore[no-untyped-def]
+    """The rotation vector of the matrix `r` (3, 3) into `w` (3,); its length is in [0, pi]."""
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]  # 2 sin(t) times the axis
+    sine, cosine = 0.5 * math.sqrt(x * x + y * y + z * z), 0.5 * (r[0, 0] + r[1, 1] + r[2, 2] - 1.0)
+    angle = math.atan2(sine, cosine)
+    if cosine > -0.9:
+        scale = 0.5 * angle / sine if sine > 1e-4 else 0.5 + sine * sine / 12.0
+        w[0], w[1], w[2] = x * scale, y * scale, z * scale
+        return
+    # Near pi the sine is lost: the axis is the longest column of R + Rt + (1 - trace) 1, which is
+    # 2 (1 - cos t) times axis axis-t.
+    shift, longest = 1.0 - r[0, 0] - r[1, 1] - r[2, 2], 0
+    for a in range(1, 3):
+        if r[a, a] > r[longest, longest]:
+            longest = a
+    for a in range(3):
+        w[a] = r[a, longest] + r[longest, a] + (shift if a == longest else 0.0)
+    length = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    scale = math.copysign(angle / length, x * w[0] + y * w[1] + z * w[2])
+    w[0], w[1], w[2] = w[0] * scale, w[1] * scale, w[2] * scale
+
+
+@kernel
 def project_kernel(points, rotation, position, k, px, jacobian, depth):  # type: ignore[no-untyped-def]
     """Pixels (2K,), Jacobian (2K, 6) in the local increment, and depths (K,) of points (K, 3).
 
@@ -356,29 +456,79 @@ def project_kernel(points, rotation, position, k, px, jacobian, depth):  # type:
 
     With Xc = Rt (P - p): dXc/dp = -Rt and, for R exp(dtheta), dXc/dtheta = [Xc]x.
     """
+    pinhole = pinhole_kernel(k)
+    # Scalars, for the compiler cannot tell that the arrays it fills are not those it reads.
+    fu, fv, cu, cv, px0, py0, pz0 = k[0], k[1], k[2], k[3], position[0], position[1], position[2]
+    r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
+    r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
+    r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
     for i in range(points.shape[0]):
-        dx = points[i, 0] - position[0]
-        dy = points[i, 1] - position[1]
-        dz = points[i, 2] - position[2]
-        xc = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
-        yc = rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz
-        zc = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
+        dx, dy, dz = points[i, 0] - px0, points[i, 1] - py0, points[i, 2] - pz0
+        xc, yc, zc = r00 * dx + r10 * dy + r20 * dz, r01 * dx + r11 * dy + r21 * dz, r02 * dx + r12 * dy + r22 * dz
         depth[i] = zc
         inverse = 1.0 / zc if zc != 0.0 else math.inf
         x, y = xc * inverse, yc * inverse
-        xd, yd, xx, xy, yx, yy = distort_kernel(x, y, k)
-        if not xx * yy - xy * yx > _FOLDED:
-            depth[i] = math.nan
-        px[2 * i] = k[0] * xd + k[2]
-        px[2 * i + 1] = k[1] * yd + k[3]
+        xd, yd, xx, xy, yx, yy = x, y, 1.0, 0.0, 0.0, 1.0
+        if not pinhole:
+            xd, yd, xx, xy, yx, yy = distort_kernel(x, y, k)
+            if not xx * yy - xy * yx > _FOLDED:
+                depth[i] = math.nan
+        u, v = 2 * i, 2 * i + 1
+        px[u], px[v] = fu * xd + cu, fv * yd + cv
+        gx, gy = fu * inverse * xx, fu * inverse * xy
+        gz = -(gx * x + gy * y)
+        jacobian[u, 0] = -(gx * r00 + gy * r01 + gz * r02)
+        jacobian[u, 1] = -(gx * r10 + gy * r11 + gz * r12)
+        jacobian[u, 2] = -(gx * r20 + gy * r21 + gz * r22)
+        jacobian[u, 3], jacobian[u, 4], jacobian[u, 5] = gy * zc - gz * yc, gz * xc - gx * zc, gx * yc - gy * xc
+        gx, gy = fv * inverse * yx, fv * inverse * yy
+        gz = -(gx * x + gy * y)
+        jacobian[v, 0] = -(gx * r00 + gy * r01 + gz * r02)
+        jacobian[v, 1] = -(gx * r10 + gy * r11 + gz * r12)
+        jacobian[v, 2] = -(gx * r20 + gy * r21 + gz * r22)
+        jacobian[v, 3], jacobian[v, 4], jacobian[v, 5] = gy * zc - gz * yc, gz * xc - gx * zc, gx * yc - gy * xc
+
+
+@kernel
+def lines_kernel(edges, rotation, position, k, first, lines, jacobian):  # type: ignore[no-untyped-def]
+    """Image lines rho, theta of `edges` (L, 2, 3) over what `lines` holds from row `first` on, and
+    their Jacobian in the local increment.
+
+    (rho, theta) and (-rho, theta + pi) are one line: the form nearest in angle to the line that was
+    in `lines` is chosen, so that a difference of the two has no jumps. NaN where there is no line.
+
+    The camera centre p and the edge A, B span the plane with normal n = (A - p) x (B - p); in the
+    camera n_c = Rt n, and the line is l = K^-T n_c. dn = dp x (A - B); dn_c = [n_c]x dtheta.
+    """
+    for i in range(edges.shape[0]):
+        rho, theta = first + 2 * i, first + 2 * i + 1
+        ax, ay, az = edges[i, 0, 0] - position[0], edges[i, 0, 1] - position[1], edges[i, 0, 2] - position[2]
+        bx, by, bz = edges[i, 1, 0] - position[0], edges[i, 1, 1] - position[1], edges[i, 1, 2] - position[2]
+        nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        cx = rotation[0, 0] * nx + rotation[1, 0] * ny + rotation[2, 0] * nz
+        cy = rotation[0, 1] * nx + rotation[1, 1] * ny + rotation[2, 1] * nz
+        cz = rotation[0, 2] * nx + rotation[1, 2] * ny + rotation[2, 2] * nz
+        l0, l1 = cx / k[0], cy / k[1]
+        l2 = cz - k[2] * l0 - k[3] * l1
+        size = l0 * l0 + l1 * l1
+        norm = math.sqrt(size) if size > 0.0 else math.nan
+        angle, sign = math.atan2(l1, l0), 1.0
+        turns = math.floor((lines[theta] - angle) / math.pi + 0.5)
+        if turns % 2.0 == 1.0:
+            sign = -1.0
+        lines[rho], lines[theta] = -sign * l2 / norm, angle + turns * math.pi + 0.0 * norm
+        # Derivatives of both in n_c: columns of K^-T, then the normal form.
         for row in range(2):
-            f = k[row]
-            gx = f * (xx if row == 0 else yx) * inverse
-            gy = f * (xy if row == 0 else yy) * inverse
-            gz = -(gx * x + gy * y)
-            j = 2 * i + row
-            for axis in range(3):
-                jacobian[j, axis] = -(gx * rotation[axis, 0] + gy * rotation[axis, 1] + gz * rotation[axis, 2])
-            jacobian[j, 3] = gy * zc - gz * yc
-            jacobian[j, 4] = gz * xc - gx * zc
-            jacobian[j, 5] = gx * yc - gy * xc
+            if row == 0:
+                d0, d1, d2 = sign * l2 * l0 / (size * norm), sign * l2 * l1 / (size * norm), -sign / norm
+            else:
+                d0, d1, d2 = -l1 / size, l0 / size, 0.0
+            gx, gy, gz = (d0 - k[2] * d2) / k[0], (d1 - k[3] * d2) / k[1], d2
+            wx = rotation[0, 0] * gx + rotation[0, 1] * gy + rotation[0, 2] * gz
+            wy = rotation[1, 0] * gx + rotation[1, 1] * gy + rotation[1, 2] * gz
+            wz = rotation[2, 0] * gx + rotation[2, 1] * gy + rotation[2, 2] * gz
+            j = rho + row
+            # g . (dp x (A - B)) = ((A - B) x g) . dp, and g . (n_c x dtheta) = (g x n_c) . dtheta
+            ex, ey, ez = ax - bx, ay - by, az - bz
+            jacobian[j, 0], jacobian[j, 1], jacobian[j, 2] = ey * wz - ez * wy, ez * wx - ex * wz, ex * wy - ey * wx
+            jacobian[j, 3], jacobian[j, 4], jacobian[j, 5] = gy * cz - gz * cy, gz * cx - gx * cz, gx * cy - gy * cx

@@ -2,8 +2,8 @@
 monitoring (RAIM), and what such a test can and cannot see.
 
 With H and the residual whitened first (H_w = L⁻¹H, r_w = L⁻¹(y - μ), Σ = L Lᵀ) the squared residual
-left by a least-squares fit is χ² with 2K - 6 degrees of freedom when the keypoints err as they
-claim (Joerger & Pervan 2014). Whatever could not be checked is NOT_MONITORED, never USE.
+left by a least-squares fit is χ² with n - 6 degrees of freedom, n the rows that were measured, when
+they err as they claim (Joerger & Pervan 2014). Whatever could not be checked is NOT_MONITORED, never USE.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class IntegrityBatch:
 def check_integrity(est: PoseEstimate, false_alarm_rate: float = FALSE_ALARM_RATE) -> IntegrityVerdict:
     """Does the residual fit the stated uncertainty? DO_NOT_USE when p < `false_alarm_rate`.
 
-    p is the survival function of χ²(2K - 6) at the squared whitened residual. NOT_MONITORED unless
+    p is the survival function of χ²(n - 6) at the squared whitened residual. NOT_MONITORED unless
     the solver converged, redundancy is left, and the pose is known well enough for a linear test.
     Raises InputError for a rate outside (0, 1).
     """
@@ -93,9 +93,7 @@ def check_integrity(est: PoseEstimate, false_alarm_rate: float = FALSE_ALARM_RAT
 def check_integrity_batch(batch: PoseEstimateBatch, false_alarm_rate: float = FALSE_ALARM_RATE) -> IntegrityBatch:
     """`check_integrity` of N estimates, as arrays. Raises InputError for a rate outside (0, 1)."""
     check_rate(false_alarm_rate, "false_alarm_rate")
-    monitored = batch.converged & np.isfinite(batch.chi2) & (batch.dof > 0)
-    variances = np.diagonal(batch.cov_px, axis1=1, axis2=2)
-    monitored &= _redundant(batch.mean_px, variances) & _first_order(batch.positions, batch.covs, batch.points)
+    monitored = batch.converged & (batch.dof > 0) & (batch.sharp_rows > 6) & (batch.relative_sigma < LARGEST_SHARE)
     statistic = np.where(monitored, batch.chi2, np.nan)
     dof = batch.dof
     p = np.asarray(chdtrc(dof, statistic)) if dof > 0 else np.full(len(batch), np.nan)
@@ -113,15 +111,15 @@ def check_integrity_as_published(est: PoseEstimate) -> tuple[float, float]:
     times the nominal. (Line 7 then reads the density of χ² where a tail probability is meant; the
     tail is given here.) Raises InputError where there is no converged estimate.
     """
-    factor = _cholesky(_solved(est).keypoints.cov_px)
-    statistic, p = _as_published(est.residual[None], est.jacobian[None], factor[None])
+    solved = _solved(est)
+    statistic, p = _as_published(solved.residual[None], solved.jacobian[None], solved.factor[None])
     return float(statistic[0]), float(p[0])
 
 
 def check_integrity_batch_as_published(batch: PoseEstimateBatch) -> tuple[Array, Array]:
     """`check_integrity_as_published` of N estimates: (N,) statistics and p-values, NaN where not converged."""
     good = batch.converged
-    factor = _cholesky(batch.cov_px if len(batch.cov_px) == 1 else batch.cov_px[good])
+    factor = batch.factors if len(batch.factors) == 1 else batch.factors[good]
     out = np.full((2, len(batch)), np.nan)
     out[:, good] = _as_published(batch.residuals[good], batch.jacobians[good], factor)
     return out[0], out[1]
@@ -189,29 +187,14 @@ def _obstacle(est: PoseEstimate) -> str | None:
         return f"no unique estimate to check: the solver ended {est.status.value}"
     if est.dof <= 0:
         return f"no redundancy: {len(est.residual)} equations for 6 unknowns"
-    if not math.isfinite(est.chi2):
-        return f"the residual is {est.chi2}"
-    variances = np.diagonal(est.keypoints.cov_px)[None]
-    if not _redundant(est.keypoints.mean_px[None], variances)[0]:
-        return "no redundancy in effect: too few corners are known better than the runway is large in the image"
-    assert est.pose is not None  # as it converged
-    assert est.cov is not None
-    if not _first_order(est.pose.position_m[None], est.cov[None], est.points[None])[0]:
+    if est.sharp_rows <= 6:
+        return (
+            f"no redundancy in effect: only {est.sharp_rows} of {len(est.residual)} measured numbers are known better "
+            "than the runway is large in the image, or a prior than the runway is distant"
+        )
+    if not est.relative_sigma < LARGEST_SHARE:
         return f"the position is uncertain by more than {LARGEST_SHARE:.0%} of the distance: no longer first-order"
     return None
-
-
-def _redundant(mean_px: Array, variances: Array) -> NDArray[np.bool_]:
-    """Whether more than six coordinates are measurements (N,): known better than the runway's extent."""
-    extent = np.ptp(mean_px, axis=1).max(axis=1)
-    return np.asarray((variances < extent[:, None] ** 2).sum(axis=1) > 6)
-
-
-def _first_order(positions: Array, covs: Array, points: Array) -> NDArray[np.bool_]:
-    """Whether the pose is known well enough (N,) for the linearisation that covariance and test rest on."""
-    distance = np.linalg.norm(points - positions[:, None], axis=2).min(axis=1)
-    spread = np.sqrt(np.trace(covs[:, :3, :3], axis1=1, axis2=2))
-    return np.asarray(spread < LARGEST_SHARE * distance)
 
 
 def _solved(est: PoseEstimate) -> PoseEstimate:
@@ -221,16 +204,16 @@ def _solved(est: PoseEstimate) -> PoseEstimate:
     return est
 
 
-def _whitened(est: PoseEstimate, bias_px: ArrayLike) -> Array:
-    """L⁻¹ b (2K,)."""
-    shape = est.keypoints.mean_px.shape
-    given = np.asarray(bias_px, np.float64)
-    bias = as_array(given.reshape(shape) if given.size == shape[0] * 2 else given, shape, "bias_px")
-    return np.asarray(np.linalg.solve(_cholesky(est.keypoints.cov_px), bias.ravel()), np.float64)
-
-
-def _cholesky(cov: Array) -> Array:
-    return np.asarray(np.linalg.cholesky(cov), np.float64)
+def _whitened(est: PoseEstimate, bias: ArrayLike) -> Array:
+    """L⁻¹ b (n,) of a shift of the keypoints (K, 2), or of all that was measured (n,)."""
+    rows, keypoints = len(est.residual), 2 * len(est.points)
+    given = as_array(np.ravel(bias), (None,), "bias_px")
+    if len(given) not in (rows, keypoints):
+        wanted = f"{est.keypoints.mean_px.shape}" + (f" or ({rows},)" if rows > keypoints else "")
+        raise InputError(f"bias_px: expected shape {wanted}, got {np.shape(bias)}")
+    whole = np.zeros(rows)
+    whole[: len(given)] = given
+    return np.asarray(np.linalg.solve(est.factor, whole), np.float64)
 
 
 def _noncentrality(est: PoseEstimate, bias_px: ArrayLike) -> float:

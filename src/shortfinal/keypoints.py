@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shortfinal.errors import InputError
-from shortfinal.geometry import as_array
+from shortfinal.geometry import as_array, frozen
 
 Array = NDArray[np.float64]
 
@@ -30,13 +31,12 @@ class GaussianKeypoints:
     cov_px: Array
 
     def __post_init__(self) -> None:
-        mean = as_array(self.mean_px, (None, 2), "mean_px")
-        if len(mean) == 0:
-            raise InputError("mean_px: at least one keypoint is needed")
-        if np.abs(mean).max() > _FARTHEST_PX:
-            raise InputError(f"mean_px: {np.abs(mean).max():.3g} is no pixel of any camera")
+        mean = _checked_mean(self.mean_px)
         cov = as_array(self.cov_px, (2 * len(mean), 2 * len(mean)), "cov_px")
-        _check_covariance(cov)
+        check_covariance(cov, "cov_px", lambda row: f"keypoint {row // 2} {'uv'[row % 2]}")
+        largest = float(np.diag(cov).max())
+        if largest > _FARTHEST_PX**2:
+            raise InputError(f"cov_px: a standard deviation of {np.sqrt(largest):.3g} px is no measurement")
         object.__setattr__(self, "mean_px", mean)
         object.__setattr__(self, "cov_px", cov)
 
@@ -46,15 +46,24 @@ class GaussianKeypoints:
 
         Raises InputError unless every sigma is finite and positive.
         """
-        mean = as_array(mean_px, (None, 2), "mean_px")
+        mean = _checked_mean(mean_px)
         try:
             sigma = np.broadcast_to(np.asarray(sigma_px, np.float64), mean.shape)
         except (TypeError, ValueError) as error:
             raise InputError(f"sigma_px: expected one number or an array like {mean.shape}") from error
-        if not (np.isfinite(sigma) & (sigma > 0)).all():
-            k, axis = (int(i) for i in np.argwhere(~(np.isfinite(sigma) & (sigma > 0)))[0])
+        good = (sigma > 0) & (sigma < np.inf)
+        if not good.all():
+            k, axis = (int(i) for i in np.argwhere(~good)[0])
             raise InputError(f"sigma_px: keypoint {k} {'uv'[axis]} is {sigma[k, axis]}; it must be finite and > 0")
-        return cls(mean, np.diag(np.minimum(sigma, 2 * _FARTHEST_PX).ravel() ** 2))
+        if sigma.max() > _FARTHEST_PX:
+            raise InputError(f"sigma_px: a standard deviation of {sigma.max():.3g} px is no measurement")
+        cov = np.zeros((mean.size, mean.size))
+        np.fill_diagonal(cov, sigma.ravel() ** 2)
+        if not cov.diagonal().min() > 0:
+            raise InputError(f"sigma_px: {sigma.min():.3g} squared is zero; it must be > 0")
+        keypoints = object.__new__(cls)  # a positive diagonal needs no eigenvalues to be checked
+        keypoints.__dict__.update(mean_px=mean, cov_px=frozen(cov))
+        return keypoints
 
     @property
     def sigma_px(self) -> Array:
@@ -71,25 +80,32 @@ class GaussianKeypoints:
         return self.cov_px[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
 
 
-def _check_covariance(cov: Array) -> None:
+def _checked_mean(mean_px: ArrayLike) -> Array:
+    mean = as_array(mean_px, (None, 2), "mean_px")
+    if len(mean) == 0:
+        raise InputError("mean_px: at least one keypoint is needed")
+    farthest = max(float(mean.max()), -float(mean.min()))
+    if farthest > _FARTHEST_PX:
+        raise InputError(f"mean_px: {farthest:.3g} is no pixel of any camera")
+    return mean
+
+
+def check_covariance(cov: Array, name: str, row_name: Callable[[int], str]) -> None:
+    """Raises InputError unless `cov` (n, n) is symmetric and positive definite; `row_name` says what a row is of."""
     variance = np.diag(cov)
-    if variance.max() > _FARTHEST_PX**2:
-        raise InputError(f"cov_px: a standard deviation of {np.sqrt(variance.max()):.3g} px is no measurement")
     if (variance <= 0).any():
         row = int(np.argmax(variance <= 0))
-        raise InputError(
-            f"cov_px: the variance of keypoint {row // 2} {'uv'[row % 2]} is {variance[row]}; it must be > 0"
-        )
+        raise InputError(f"{name}: the variance of {row_name(row)} is {variance[row]}; it must be > 0")
     # Compared as correlations, so that the tolerances have no unit.
     sigma = np.sqrt(variance)
     correlation = cov / np.outer(sigma, sigma)
     skew = np.abs(correlation - correlation.T)
     if skew.max() > 1e-8:
         i, j = (int(n) for n in np.unravel_index(int(skew.argmax()), skew.shape))
-        raise InputError(f"cov_px: not symmetric: entry [{i}, {j}] is {cov[i, j]}, [{j}, {i}] is {cov[j, i]}")
+        raise InputError(f"{name}: not symmetric: entry [{i}, {j}] is {cov[i, j]}, [{j}, {i}] is {cov[j, i]}")
     smallest = float(np.linalg.eigvalsh(correlation)[0])
     if smallest < 1e-10:
         raise InputError(
-            f"cov_px: not positive definite (smallest eigenvalue of the correlations {smallest:.2e}); "
+            f"{name}: not positive definite (smallest eigenvalue of the correlations {smallest:.2e}); "
             "a valid covariance has only positive ones"
         )

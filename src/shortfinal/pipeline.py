@@ -18,6 +18,7 @@ from shortfinal.geometry import Camera, PixelWindow, Pose, as_array, project
 from shortfinal.integrity import FALSE_ALARM_RATE, Decision, IntegrityVerdict, check_integrity, check_rate
 from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
 from shortfinal.pose import PoseEstimate, estimate_pose
+from shortfinal.protection import FAULT_PRIOR, INTEGRITY_RISK, ProtectionLevels, protection_levels
 from shortfinal.runway import Runway
 
 Array = NDArray[np.float64]
@@ -37,6 +38,7 @@ class FrameResult:
     keypoints: GaussianKeypoints | None  # in the frame's pixels
     estimate: PoseEstimate | None
     verdict: IntegrityVerdict
+    protection: ProtectionLevels | None = None  # what bounds the error of an accepted frame; None if not monitored
     timings: dict[str, float] = field(default_factory=dict)  # "detect_ms", "solve_ms", "doubt_ms"
 
     def to_dict(self) -> dict[str, Any]:
@@ -61,6 +63,9 @@ class FrameResult:
             record["position_m"] = self.estimate.pose.position_m.tolist()
             record["attitude_deg"] = list(self.estimate.pose.attitude)
             record["pose_cov"] = self.estimate.cov.tolist()
+        if self.protection is not None:
+            levels = self.protection.levels._asdict()
+            record["protection"] = {axis: level if math.isfinite(level) else None for axis, level in levels.items()}
         return record
 
 
@@ -72,16 +77,29 @@ class LandingPipeline:
     """
 
     def __init__(
-        self, detector: KeypointDetector, runway: Runway, camera: Camera, *, false_alarm_rate: float = FALSE_ALARM_RATE
+        self,
+        detector: KeypointDetector,
+        runway: Runway,
+        camera: Camera,
+        *,
+        false_alarm_rate: float = FALSE_ALARM_RATE,
+        integrity_risk: float = INTEGRITY_RISK,
+        fault_prior: float = FAULT_PRIOR,
     ) -> None:
-        """Raises InputError for a rate outside (0, 1) or a model whose keypoints are not the four corners."""
+        """The last two are for the protection levels, as in `protection_levels`.
+
+        Raises InputError for a probability outside (0, 1) or a model whose keypoints are not the four corners.
+        """
         if detector.info.keypoints != CORNER_NAMES:
             raise InputError(
                 f"detector: its keypoints are {', '.join(detector.info.keypoints)}; expected {', '.join(CORNER_NAMES)}"
             )
-        check_rate(false_alarm_rate, "false_alarm_rate")
+        for name, rate in (
+            ("false_alarm_rate", false_alarm_rate), ("integrity_risk", integrity_risk), ("fault_prior", fault_prior)
+        ):  # fmt: skip
+            check_rate(rate, name)
         self.detector, self.runway, self.camera = detector, runway, camera
-        self.false_alarm_rate = false_alarm_rate
+        self.false_alarm_rate, self.integrity_risk, self.fault_prior = false_alarm_rate, integrity_risk, fault_prior
         self._last: Pose | None = None
 
     def step(
@@ -111,22 +129,33 @@ class LandingPipeline:
         try:
             crop, keypoints, obstacle = _timed(timings, "detect_ms", lambda: self._look(frame_rgb, box, prior))
         except InputError as error:
-            return FrameResult(timestamp_s, None, None, None, self._not_monitored(str(error)), timings)
+            return FrameResult(timestamp_s, None, None, None, self._not_monitored(str(error)), None, timings)
         if obstacle:
-            return FrameResult(timestamp_s, crop, keypoints, None, self._not_monitored(obstacle), timings)
-        estimate, verdict = self.judge(keypoints, timings)
-        return FrameResult(timestamp_s, crop, keypoints, estimate, verdict, timings)
+            return FrameResult(timestamp_s, crop, keypoints, None, self._not_monitored(obstacle), None, timings)
+        estimate, verdict, protection = self.judge(keypoints, timings)
+        return FrameResult(timestamp_s, crop, keypoints, estimate, verdict, protection, timings)
 
     def judge(
         self, keypoints: GaussianKeypoints, timings: dict[str, float] | None = None
-    ) -> tuple[PoseEstimate, IntegrityVerdict]:
+    ) -> tuple[PoseEstimate, IntegrityVerdict, ProtectionLevels | None]:
         """Solve and doubt: from keypoints in the frame's pixels, whoever found them."""
         timings = {} if timings is None else timings
         estimate = _timed(timings, "solve_ms", lambda: estimate_pose(keypoints, self.runway.corners, self.camera))
-        verdict = _timed(timings, "doubt_ms", lambda: check_integrity(estimate, self.false_alarm_rate))
+        verdict, protection = _timed(timings, "doubt_ms", lambda: self._doubt(estimate))
         if verdict.decision is Decision.USE:
             self._last = estimate.pose
-        return estimate, verdict
+        return estimate, verdict, protection
+
+    def _doubt(self, estimate: PoseEstimate) -> tuple[IntegrityVerdict, ProtectionLevels | None]:
+        verdict = check_integrity(estimate, self.false_alarm_rate)
+        if verdict.decision is Decision.NOT_MONITORED:
+            return verdict, None
+        return verdict, protection_levels(
+            estimate,
+            integrity_risk=self.integrity_risk,
+            fault_prior=self.fault_prior,
+            false_alarm_rate=self.false_alarm_rate,
+        )
 
     def _not_monitored(self, reason: str) -> IntegrityVerdict:
         return IntegrityVerdict(Decision.NOT_MONITORED, (reason,), 0, self.false_alarm_rate)

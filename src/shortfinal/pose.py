@@ -1,16 +1,19 @@
-"""The pose that best explains Gaussian keypoints, with its covariance and an honest status.
+"""The pose that best explains what was measured, with its covariance and an honest status.
 
 The cost is the whitened sum of squares of Valentin et al. 2025 (arXiv 2508.09732, Algorithm 1),
-J(pose) = |L⁻¹ (keypoints - projection)|² with L Lᵀ = Σ, minimised by Levenberg-Marquardt
-(Marquardt 1963) in the local increment of `Pose.plus`. A plane seen at a grazing angle has two
-near-optima, so both solutions of IPPE (Collins & Bartoli 2014) are starts, and the lowest physical
-optimum is kept. Frames, axes and units: the table of conventions in docs/architecture.md.
+J(pose) = |L⁻¹ (measured - predicted)|² with L Lᵀ = Σ. Measured are keypoints and, where given, edge
+lines, an attitude, a position and an altitude, each with its covariance: they are rows like any
+other. J is minimised by Gauss-Newton, damped (Levenberg-Marquardt, Marquardt 1963) where that fails,
+in the local increment of `Pose.plus`. A plane seen at a grazing angle has two near-optima, so both
+solutions of IPPE (Collins & Bartoli 2014) are starts, and the lowest physical optimum is kept.
+Frames, axes and units: the table of conventions in docs/architecture.md.
 """
 
 from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import Enum
@@ -18,26 +21,53 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from shortfinal.errors import InputError
+from shortfinal.features import (
+    Altitude,
+    AttitudePrior,
+    Feature,
+    GaussianLines,
+    PositionPrior,
+    feature_rows,
+    given_as,
+)
 from shortfinal.geometry import (
-    BODY_FROM_CAMERA,
     Camera,
     Pose,
     as_array,
-    exp_kernel,
-    normalise_kernel,
+    cayley_kernel,
+    copy_kernel,
+    frozen,
+    kernel,
+    lines_kernel,
+    log_kernel,
+    nearest_rotation,
+    product_kernel,
     project_kernel,
 )
-from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
+from shortfinal.keypoints import GaussianKeypoints
+from shortfinal.starts import (
+    carve_kernel,
+    flatten_kernel,
+    known_attitude_start_kernel,
+    known_position_start_kernel,
+    level_start_kernel,
+    physical_kernel,
+    planar_starts_kernel,
+    scratch_size,
+    three_point_starts_kernel,
+    widest_triple_kernel,
+)
 
 Array = NDArray[np.float64]
 
 # A second optimum less than this much worse in χ² cannot be told apart: at 2 ln 1000 the data are
 # a thousand times likelier under the first.
 AMBIGUITY_CHI2 = 2.0 * math.log(1000.0)
+# A position prior and an altitude this many standard deviations apart are not the same flight.
+CONTRADICTION_SIGMAS = 6.0
 MAX_ITERATIONS = 50
 CHUNK = 512  # problems a thread takes at once: some milliseconds of work
 
@@ -46,8 +76,8 @@ class SolverStatus(Enum):
     """How a solve ended. Only the first two come with a pose."""
 
     CONVERGED = "converged"  # one physical optimum, well determined
-    AMBIGUOUS = "ambiguous"  # a second physical optimum explains the keypoints about as well
-    ILL_CONDITIONED = "ill-conditioned"  # the points leave a direction free, or Σ is not positive definite
+    AMBIGUOUS = "ambiguous"  # a second physical optimum explains the measurements about as well
+    ILL_CONDITIONED = "ill-conditioned"  # the measurements leave a direction free, or Σ is not positive definite
     BEHIND_CAMERA = "behind-camera"  # every optimum has a point behind, or the camera under ground or upside down
     MAX_ITERATIONS = "max-iterations"  # no start reached an optimum in the iterations allowed
     NON_FINITE = "non-finite"  # NaN or infinity, in the input or (by overflow) in the arithmetic
@@ -58,77 +88,120 @@ STATUS_OF_CODE = tuple(SolverStatus)
 _CONVERGED, _AMBIGUOUS, _ILL_CONDITIONED, _BEHIND_CAMERA, _MAX_ITERATIONS, _NON_FINITE = range(len(STATUS_OF_CODE))
 
 
-class Feature(NamedTuple):
-    """One thing measured: its name, and its rows in the residual, the Jacobian and the factor."""
-
-    name: str
-    rows: slice
-
-
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
     """A pose, how sure it is, and what is left over.
 
     With a status other than CONVERGED and AMBIGUOUS there is no estimate: `pose` and `cov` are
     None, and `residual`, `jacobian` and `chi2` are NaN. "Whitened" is multiplied by L⁻¹, Σ = L Lᵀ.
+    The n rows are those of `features`, in their order.
     """
 
     pose: Pose | None
     cov: Array | None  # (6, 6) of the local increment, m and rad: (Hᵀ Σ⁻¹ H)⁻¹, the Cramér-Rao bound
     status: SolverStatus
-    residual: Array  # (2K,) whitened keypoints minus projection
-    jacobian: Array  # (2K, 6) whitened d(projection) / d(local increment)
+    residual: Array  # (n,) whitened measured minus predicted
+    jacobian: Array  # (n, 6) whitened d(predicted) / d(local increment)
     chi2: float  # the cost: sum of squares of the residual
-    iterations: int  # Levenberg-Marquardt steps tried, over all starts
+    iterations: int  # steps tried, over all starts
+    sharp_rows: int  # rows whose sigma is smaller than the scale of what they measure (see check_integrity)
+    relative_sigma: float  # of the position, over the distance to the nearest point
     keypoints: GaussianKeypoints
     points: Array  # (K, 3) m, runway frame
     camera: Camera
+    attitude_prior: AttitudePrior | None = None
+    position_prior: PositionPrior | None = None
+    altitude: Altitude | None = None
+    lines: GaussianLines | None = None
+    edges: Array | None = None  # (L, 2, 3) m, runway frame
 
     @property
     def dof(self) -> int:
-        """Degrees of freedom left for checking: 2K - 6."""
+        """Degrees of freedom left for checking: rows less six."""
         return len(self.residual) - 6
 
     @cached_property
     def features(self) -> tuple[Feature, ...]:
         """What was measured, in the order of the rows."""
-        return keypoint_features(len(self.points))
+        lines = 0 if self.lines is None else len(self.lines.mean)
+        priors = (self.attitude_prior, self.position_prior, self.altitude)
+        return feature_rows(len(self.points), lines, *(prior is not None for prior in priors))
 
     @cached_property
     def factor(self) -> Array:
         """L (n, n), the Cholesky factor of the covariance of all rows: whitening divides by it."""
-        return np.asarray(np.linalg.cholesky(self.keypoints.cov_px))
+        return frozen(np.linalg.cholesky(_block_diagonal([cov[None] for cov in self._covariances()])[0]))
 
     @property
     def sigma_position_m(self) -> Array | None:
         """Standard deviations (3,) of x, y, z in the runway frame; None without an estimate."""
         return None if self.cov is None else np.sqrt(np.diag(self.cov)[:3])
 
+    def _covariances(self) -> Iterator[Array]:
+        yield self.keypoints.cov_px
+        if self.lines is not None:
+            yield self.lines.cov
+        if self.attitude_prior is not None:
+            yield self.attitude_prior.cov_rad2
+        if self.position_prior is not None:
+            yield self.position_prior.cov_m2
+        if self.altitude is not None:
+            yield np.array([[self.altitude.sigma_m**2]])
+
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimateBatch:
-    """N estimates as arrays; the numbers of a problem neither CONVERGED nor AMBIGUOUS are NaN."""
+    """N estimates as arrays; the numbers of a problem neither CONVERGED nor AMBIGUOUS are NaN.
+
+    What was measured is kept as given, with one row for all problems where it is shared.
+    """
 
     positions: Array  # (N, 3) m
     rotations: Array  # (N, 3, 3) runway_from_camera
     covs: Array  # (N, 6, 6)
     status_codes: NDArray[np.int64]  # (N,) index into STATUS_OF_CODE
-    residuals: Array  # (N, 2K) whitened
-    jacobians: Array  # (N, 2K, 6) whitened
+    residuals: Array  # (N, n) whitened
+    jacobians: Array  # (N, n, 6) whitened
     chi2: Array  # (N,)
     iterations: NDArray[np.int64]  # (N,)
+    sharp_rows: NDArray[np.int64]  # (N,) as in PoseEstimate
+    relative_sigma: Array  # (N,)
     mean_px: Array  # (N, K, 2)
-    cov_px: Array  # (N, 2K, 2K), or (1, 2K, 2K) when shared
-    points: Array  # (N, K, 3), or (1, K, 3) when shared
+    cov_px: Array  # (N or 1, 2K, 2K)
+    points: Array  # (N or 1, K, 3)
     camera: Camera
+    line_mean: Array  # (N or 1, L, 2), L = 0 without
+    line_cov: Array  # (N or 1, 2L, 2L)
+    edges: Array  # (N or 1, L, 2, 3)
+    attitude: Array  # (N or 1, 1, 18): the prior's rotation and covariance, row by row; (1, 0, 18) without
+    position: Array  # (N or 1, 1, 12): likewise
+    altitude: Array  # (N or 1, 1, 2): likewise, height and sigma
 
     def __len__(self) -> int:
         return len(self.chi2)
 
     def __getitem__(self, i: int) -> PoseEstimate:
-        """Problem `i` by itself. Raises InputError if its keypoints are no valid Gaussian."""
-        mean, cov, points = (a[i if len(a) > 1 else 0] for a in (self.mean_px, self.cov_px, self.points))
-        return _estimate(self._kernel_arrays(), i, GaussianKeypoints(mean, cov), points, self.camera)
+        """Problem `i` by itself. Raises InputError if what it was given is no valid measurement."""
+        mean, cov, points, line_mean, line_cov, edges, attitude, position, altitude = (
+            a[i if len(a) > 1 else 0] for a in self._given()
+        )
+        given = _Given(
+            attitude_prior=AttitudePrior(*_split(attitude, (3, 3))) if len(attitude) else None,
+            position_prior=PositionPrior(*_split(position, (3,))) if len(position) else None,
+            altitude=Altitude(*altitude[0]) if len(altitude) else None,
+            lines=GaussianLines(line_mean, line_cov) if len(line_mean) else None,
+            edges=frozen(edges.copy()) if len(edges) else None,
+        )
+        solved = (self.positions, self.rotations, self.covs, self.residuals, self.jacobians)
+        numbers = (self.status_codes, self.chi2, self.iterations, self.sharp_rows, self.relative_sigma)
+        return _estimate(
+            tuple(array[i].copy() for array in solved),
+            [array[i].item() for array in numbers],
+            GaussianKeypoints(mean, cov),
+            frozen(points.copy()),
+            self.camera,
+            given,
+        )
 
     @property
     def converged(self) -> NDArray[np.bool_]:
@@ -137,15 +210,31 @@ class PoseEstimateBatch:
 
     @property
     def dof(self) -> int:
-        """Degrees of freedom left for checking: 2K - 6."""
+        """Degrees of freedom left for checking: rows less six."""
         return int(self.residuals.shape[1]) - 6
+
+    @cached_property
+    def features(self) -> tuple[Feature, ...]:
+        """What was measured, in the order of the rows."""
+        sizes = (self.mean_px.shape[1], self.line_mean.shape[1])
+        return feature_rows(*sizes, *(bool(a.shape[1]) for a in (self.attitude, self.position, self.altitude)))
+
+    @cached_property
+    def factors(self) -> Array:
+        """L (N or 1, n, n), the Cholesky factors of the covariance of all rows; NaN where there is none."""
+        turns, shifts = (a[:, :, -9:].reshape(len(a), *2 * (3 * a.shape[1],)) for a in (self.attitude, self.position))
+        covs = [self.cov_px, self.line_cov, turns, shifts, self.altitude[:, :, 1:] ** 2]
+        return frozen(_cholesky(_block_diagonal([cov for cov in covs if cov.shape[1]])))
 
     def status(self, i: int) -> SolverStatus:
         """The status of problem `i`."""
         return STATUS_OF_CODE[int(self.status_codes[i])]
 
-    def _kernel_arrays(self) -> _Result:
-        return _Result(*(getattr(self, name) for name in _Result._fields))
+    def _given(self) -> tuple[Array, ...]:
+        return (
+            self.mean_px, self.cov_px, self.points, self.line_mean, self.line_cov, self.edges,
+            self.attitude, self.position, self.altitude,
+        )  # fmt: skip
 
 
 def estimate_pose(
@@ -154,29 +243,43 @@ def estimate_pose(
     camera: Camera,
     *,
     initial: Pose | None = None,
+    attitude_prior: AttitudePrior | Sequence[Any] | None = None,
+    position_prior: PositionPrior | Sequence[Any] | None = None,
+    altitude: Altitude | Sequence[float] | None = None,
+    lines: GaussianLines | Sequence[Any] | None = None,
+    edges: ArrayLike | None = None,
     max_iterations: int = MAX_ITERATIONS,
 ) -> PoseEstimate:
     """The most likely pose of `camera`, given where it sees `points` (K, 3; metres, runway frame).
 
+    K is three or more. Further measurements, each a type of `shortfinal.features` or the pair it
+    holds: an attitude, a position, an altitude, and image lines of straight `edges` (L, 2, 3; both
+    ends in metres). A prior as sharp as 1e-9 rad makes the attitude known.
+
     `initial` is one more start beside the solver's own; `max_iterations` holds for each start.
     A physical optimum has every point in front of the camera, the camera above z = 0, and the top
-    of the image upwards. Hopeless geometry is a status. Raises InputError for fewer than four
-    points, or points that do not match the keypoints.
+    of the image upwards. Hopeless geometry is a status. Raises InputError for fewer than three
+    points, for what does not match in number, for a covariance that is none, and for a position
+    prior and an altitude that contradict each other (CONTRADICTION_SIGMAS).
     """
-    world = as_array(points, (None, 3), "points")
-    _check_counts(len(keypoints.mean_px), len(world))
-    result = _allocate(1, len(world))
+    world = _as_points(points)
+    count = len(world)
+    _check_counts(len(keypoints.mean_px), count)
+    given = _NOTHING
+    if not (attitude_prior is None and position_prior is None and altitude is None and lines is edges is None):
+        given = _check_given(attitude_prior, position_prior, altitude, lines, edges)
+    arrays = _ABSENT if given is _NOTHING else given.arrays()
+    rows = 2 * (count + len(arrays[2])) + 3 * (len(arrays[3]) + len(arrays[4])) + len(arrays[5])
+    summary = np.empty(_SUMMARY)
+    solved = (np.empty(3), np.empty((3, 3)), np.empty((6, 6)), np.empty(rows), np.empty((rows, 6)))
+    work = np.empty(_work_size(count, len(arrays[2]), rows))
     _solve_kernel(
-        # Copies: read-only arrays are another type to the compiler, and would be compiled for anew.
-        keypoints.mean_px.reshape(1, -1).copy(),
-        keypoints.cov_px[None].copy(),
-        world[None].copy(),
-        camera.intrinsics,
-        *_starts(initial),
-        max_iterations,
-        result,
-    )
-    return _estimate(result, 0, keypoints, world, camera)
+        keypoints.mean_px, keypoints.cov_px, world, *arrays, _start(initial), camera.intrinsics, max_iterations, work,
+        *solved, summary,
+    )  # fmt: skip
+    if summary[0] == _NON_FINITE:
+        as_array(world, (None, 3), "points")
+    return _estimate(solved, summary.tolist(), keypoints, world, camera, given)
 
 
 def estimate_pose_batch(
@@ -185,351 +288,679 @@ def estimate_pose_batch(
     points: ArrayLike,
     camera: Camera,
     *,
+    attitude_prior: Sequence[ArrayLike] | None = None,
+    position_prior: Sequence[ArrayLike] | None = None,
+    altitude: Sequence[ArrayLike] | None = None,
+    lines: Sequence[ArrayLike] | None = None,
+    edges: ArrayLike | None = None,
     max_iterations: int = MAX_ITERATIONS,
     threads: int | None = None,
 ) -> PoseEstimateBatch:
-    """`estimate_pose` for N problems: keypoints (N, K, 2), covariance (N, 2K, 2K) or one (2K, 2K),
-    points (N, K, 3) or one (K, 3); on `threads` threads (default: one per processor).
+    """`estimate_pose` for N problems, on `threads` threads (default: one per processor).
+
+    Each array has a leading axis of N, or lacks it and is shared: keypoints (N, K, 2), which are
+    never shared, covariance (2K, 2K), points (K, 3); attitude_prior: rotations (3, 3) and covariance
+    (3, 3); position_prior: positions (3,) and covariance (3, 3); altitude: heights and sigmas, each a
+    number; lines: mean (L, 2) and covariance (2L, 2L), with edges (L, 2, 3).
 
     The numbers are not refused but answered: a NaN gives its problem NON_FINITE, a covariance that
-    is not positive definite ILL_CONDITIONED. Raises InputError for shapes that do not match.
+    is not positive definite or a rotation that is none ILL_CONDITIONED; priors that contradict one
+    another leave a large residual. Raises InputError for shapes that do not match.
     """
-    mean, cov, world = (np.array(a, np.float64, order="C") for a in (mean_px, cov_px, points))
-    cov, world = (a[None] if a.ndim == 2 else a for a in (cov, world))
-    _check_shapes(mean, cov, world)
+    mean = _numbers(mean_px, "mean_px")
+    if mean.ndim != 3 or mean.shape[2] != 2 or len(mean) == 0:
+        raise InputError(f"mean_px: expected shape (N, K, 2) with N > 0, got {mean.shape}")
     count, k = mean.shape[:2]
-    result, flat = _allocate(count, k), mean.reshape(count, 2 * k)
+    world = _shared(points, (k, 3), count, "points")
+    _check_counts(k, world.shape[1])
+    if (lines is None) != (edges is None):
+        raise InputError("lines and edges: give both, or neither")
+    ends = _numbers(np.empty((0, 2, 3)) if edges is None else edges, "edges")
+    if ends.ndim < 3:
+        raise InputError(f"edges: expected shape (L, 2, 3) or (N, L, 2, 3), got {ends.shape}")
+    many = ends.shape[-3]
+    line_mean, line_cov = _pair(lines, (many, 2), (2 * many, 2 * many), count, "lines")
+    given = (
+        mean,
+        _shared(cov_px, (2 * k, 2 * k), count, "cov_px"),
+        world,
+        line_mean,
+        line_cov,
+        _shared(ends, (many, 2, 3), count, "edges"),
+        _packed(attitude_prior, (3, 3), (3, 3), count, "attitude_prior"),
+        _packed(position_prior, (3,), (3, 3), count, "position_prior"),
+        _packed(altitude, (), (), count, "altitude"),
+    )
+    rows = 2 * k + 2 * many + sum(size * a.shape[1] for size, a in zip((3, 3, 1), given[6:], strict=True))
+    shapes = ((3,), (3, 3), (6, 6), (rows,), (rows, 6), (_SUMMARY,))
+    out = [np.empty((count, *shape)) for shape in shapes]
 
     def solve(start: int) -> None:
         part = slice(start, start + CHUNK)
-        _solve_kernel(
-            flat[part],
-            cov[part] if len(cov) == count else cov,
-            world[part] if len(world) == count else world,
+        _solve_many_kernel(
+            *(array[part] if len(array) == count else array for array in given),
+            _NO_START,
             camera.intrinsics,
-            *_starts(None),
             max_iterations,
-            _Result(*(array[part] for array in result)),
+            np.empty(_work_size(k, many, rows)),
+            *(array[part] for array in out),
         )
 
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         list(pool.map(solve, range(0, count, CHUNK)))
-    return PoseEstimateBatch(**result._asdict(), mean_px=mean, cov_px=cov, points=world, camera=camera)
+    *solved, summary = out
+    codes, chi2, iterations, sharp, relative = summary.T
+    whole = (a.astype(np.int64) for a in (codes, iterations, sharp))
+    status_codes, steps, sharp_rows = whole
+    positions, rotations, covs, residuals, jacobians = solved
+    mean, cov, world, line_mean, line_cov, ends, attitude, position, height = given
+    return PoseEstimateBatch(
+        positions, rotations, covs, status_codes, residuals, jacobians, chi2.copy(), steps, sharp_rows,
+        relative.copy(), mean, cov, world, camera, line_mean, line_cov, ends, attitude, position, height,
+    )  # fmt: skip
 
 
-class _Result(NamedTuple):
-    """What the kernel writes, one row a problem; the fields are those of PoseEstimateBatch."""
-
-    positions: Any
-    rotations: Any
-    covs: Any
-    residuals: Any
-    jacobians: Any
-    chi2: Any
-    status_codes: Any
-    iterations: Any
+_ABSENT = tuple(frozen(np.empty(shape)) for shape in ((0, 2), (0, 0), (0, 2, 3), (0, 18), (0, 12), (0, 2)))
+_NO_START = frozen(np.empty((0, 12)))
+_SUMMARY = 5  # status, χ², iterations, sharp rows, relative sigma
 
 
-class _Problem(NamedTuple):
-    """One problem; refilled for each. The kernels' tuples are small: passing one costs its length."""
+class _Given(NamedTuple):
+    """What was measured beside the keypoints."""
 
-    mean: Any  # (2K,) px
-    whitener: Any  # (2K, 2K) Cholesky factor L of the covariance
-    points: Any  # (K, 3)
-    intrinsics: Any  # (12,)
-    depth: Any  # (K,) scratch
+    attitude_prior: AttitudePrior | None = None
+    position_prior: PositionPrior | None = None
+    altitude: Altitude | None = None
+    lines: GaussianLines | None = None
+    edges: Array | None = None
 
-
-class _State(NamedTuple):
-    """A pose, and the whitened residual and Jacobian there."""
-
-    rotation: Any  # (3, 3)
-    position: Any  # (3,)
-    residual: Any  # (2K,)
-    jacobian: Any  # (2K, 6)
-
-
-class _System(NamedTuple):
-    """The normal equations of a step."""
-
-    normal: Any  # (6, 6) JᵀJ
-    gradient: Any  # (6,) Jᵀr
-    factor: Any  # (6, 6) Cholesky factor, damped or not
-    step: Any  # (6,)
-    turn: Any  # (3, 3)
+    def arrays(self) -> tuple[Array, ...]:
+        """As the kernel takes them; what is absent has no rows."""
+        line_mean, line_cov, edges, attitude, position, altitude = _ABSENT
+        if self.lines is not None and self.edges is not None:
+            line_mean, line_cov, edges = self.lines.mean, self.lines.cov, self.edges
+        if self.attitude_prior is not None:
+            attitude = _joined(self.attitude_prior.runway_from_camera, self.attitude_prior.cov_rad2)
+        if self.position_prior is not None:
+            position = _joined(self.position_prior.position_m, self.position_prior.cov_m2)
+        if self.altitude is not None:
+            altitude = _joined(self.altitude.height_m, self.altitude.sigma_m)
+        return line_mean, line_cov, edges, attitude, position, altitude
 
 
-class _Planar(NamedTuple):
-    """Where the planar starts are worked out."""
-
-    flat: Any  # (K, 4) coordinates in the plane, undistorted image coordinates
-    runway_from_plane: Any  # (3, 3)
-    centre: Any  # (3,) of the points
-    normal: Any  # (8, 8) of the homography
-    coefficients: Any  # (8,)
-    turn: Any  # (3, 3)
-    tilt: Any  # (3, 3)
-    camera_from_plane: Any  # (3, 3)
+_NOTHING = _Given()
 
 
-def keypoint_features(count: int) -> tuple[Feature, ...]:
-    """The features of `count` keypoints: the corners by name, further ones by number."""
-    names = [*CORNER_NAMES, *(f"point {k}" for k in range(len(CORNER_NAMES), count))][:count]
-    return tuple(Feature(name, slice(2 * k, 2 * k + 2)) for k, name in enumerate(names))
+def _check_given(attitude: Any, position: Any, altitude: Any, lines: Any, edges: ArrayLike | None) -> _Given:
+    if (lines is None) != (edges is None):
+        raise InputError("lines and edges: give both, or neither")
+    given = _Given(
+        None if attitude is None else given_as(AttitudePrior, attitude, "attitude_prior"),
+        None if position is None else given_as(PositionPrior, position, "position_prior"),
+        None if altitude is None else given_as(Altitude, altitude, "altitude"),
+        None if lines is None else given_as(GaussianLines, lines, "lines"),
+        None if edges is None else as_array(edges, (None, 2, 3), "edges"),
+    )
+    if given.lines is not None and given.edges is not None and len(given.lines.mean) != len(given.edges):
+        raise InputError(f"edges: {len(given.edges)} edges for {len(given.lines.mean)} lines; give one edge per line")
+    if given.position_prior is not None and given.altitude is not None:
+        _check_heights(given.position_prior, given.altitude)
+    return given
+
+
+def _check_heights(prior: PositionPrior, altitude: Altitude) -> None:
+    apart = abs(float(prior.position_m[2]) - altitude.height_m)
+    sigma = math.sqrt(float(prior.cov_m2[2, 2]) + altitude.sigma_m**2)
+    if apart > CONTRADICTION_SIGMAS * sigma:
+        raise InputError(
+            f"position_prior and altitude: heights of {prior.position_m[2]:.4g} m and {altitude.height_m:.4g} m are "
+            f"{apart / sigma:.1f} standard deviations apart; one of them is wrong, or less certain than stated"
+        )
 
 
 def _check_counts(keypoints: int, points: int) -> None:
     if keypoints != points:
         raise InputError(f"points: {points} points for {keypoints} keypoints; give one point per keypoint")
-    if points < 4:
-        raise InputError(
-            f"points: got {points}; three points give six equations for six unknowns and up to four poses, "
-            "with nothing left to choose or check; give at least four"
-        )
+    if points < 3:
+        raise InputError(f"points: got {points}; a pose needs at least three, and a fourth to choose and check it")
 
 
-def _check_shapes(mean: Array, cov: Array, world: Array) -> None:
-    if mean.ndim != 3 or mean.shape[2] != 2 or len(mean) == 0:
-        raise InputError(f"mean_px: expected shape (N, K, 2) with N > 0, got {mean.shape}")
-    count, k = mean.shape[:2]
-    for array, name, shape in ((cov, "cov_px", (2 * k, 2 * k)), (world, "points", (k, 3))):
-        if array.shape not in ((1, *shape), (count, *shape)):
-            raise InputError(f"{name}: expected shape {shape} or {(count, *shape)}, got {array.shape}")
-    _check_counts(k, world.shape[1])
+def _as_points(points: ArrayLike) -> Array:
+    """(K, 3); an array that is read-only and its own is used as it is, and the kernel looks for NaN in it."""
+    if type(points) is np.ndarray and points.dtype == np.float64 and points.ndim == 2 and points.shape[1] == 3:
+        flags = points.flags
+        if not flags.writeable and flags.c_contiguous and points.base is None:
+            return points
+    return as_array(points, (None, 3), "points")
 
 
-def _allocate(count: int, k: int) -> _Result:
-    shapes = ((3,), (3, 3), (6, 6), (2 * k,), (2 * k, 6), ())
-    numbers = [np.full((count, *shape), np.nan) for shape in shapes]
-    codes = [np.zeros(count, np.int64) for _ in range(2)]
-    return _Result(*numbers, *codes)
+def _numbers(value: ArrayLike, name: str) -> Array:
+    try:
+        return frozen(np.array(value, np.float64, order="C"))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected numbers, got {' '.join(repr(value).split()):.80}") from error
 
 
-def _starts(initial: Pose | None) -> tuple[Array, Array]:
-    """Given starts as arrays: rotations (S, 3, 3) and positions (S, 3), S = 0 or 1."""
-    if initial is None:
-        return np.empty((0, 3, 3)), np.empty((0, 3))
-    return np.array([initial.runway_from_camera]), np.array([initial.position_m])
+def _shared(value: ArrayLike, shape: tuple[int, ...], count: int, name: str) -> Array:
+    """`value` with a leading axis: of `count`, or of 1 where all problems share it."""
+    array = _numbers(value, name)
+    if array.shape == shape:
+        return array[None]
+    if array.shape != (count, *shape) and array.shape != (1, *shape):
+        raise InputError(f"{name}: expected shape {shape} or {(count, *shape)}, got {array.shape}")
+    return array
 
 
-def _estimate(result: _Result, i: int, keypoints: GaussianKeypoints, points: Array, camera: Camera) -> PoseEstimate:
-    status = STATUS_OF_CODE[result.status_codes[i]]
-    solved = status in (SolverStatus.CONVERGED, SolverStatus.AMBIGUOUS)
-    return PoseEstimate(
-        pose=Pose(result.positions[i], result.rotations[i]) if solved else None,
-        cov=_frozen(result.covs[i]) if solved else None,
-        status=status,
-        residual=_frozen(result.residuals[i]),
-        jacobian=_frozen(result.jacobians[i]),
-        chi2=float(result.chi2[i]),
-        iterations=int(result.iterations[i]),
+def _pair(
+    pair: Sequence[ArrayLike] | None, first: tuple[int, ...], second: tuple[int, ...], count: int, name: str
+) -> tuple[Array, Array]:
+    if pair is None:
+        return np.empty((1, *first)), np.empty((1, *second))
+    if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+        raise InputError(f"{name}: expected a pair, the values and their covariance")
+    return _shared(pair[0], first, count, name), _shared(pair[1], second, count, f"{name}: covariance")
+
+
+def _packed(
+    pair: Sequence[ArrayLike] | None, first: tuple[int, ...], second: tuple[int, ...], count: int, name: str
+) -> Array:
+    """A prior as the kernel takes it: (N or 1, 1, its numbers in a row), (1, 0, numbers) if there is none."""
+    parts = [a.reshape(len(a), -1) for a in _pair(pair, first, second, count, name)]
+    most = max(len(a) for a in parts)
+    packed = np.concatenate([np.broadcast_to(a, (most, a.shape[1])) for a in parts], axis=1)[:, None]
+    return frozen(packed[:, :0].copy() if pair is None else packed)
+
+
+def _joined(*parts: ArrayLike) -> Array:
+    return frozen(np.concatenate([np.ravel(part) for part in parts])[None])
+
+
+def _split(packed: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """The inverse of `_joined` for a value of `shape` and a covariance (3, 3)."""
+    return packed[0, :-9].reshape(shape), packed[0, -9:].reshape(3, 3)
+
+
+def _start(initial: Pose | None) -> Array:
+    """A given start as the kernel takes it: (S, 12) rotation and position, S = 0 or 1."""
+    return _NO_START if initial is None else _joined(nearest_rotation(initial.runway_from_camera), initial.position_m)
+
+
+def _estimate(
+    arrays: tuple[Array, ...],
+    numbers: list[float],
+    keypoints: GaussianKeypoints,
+    points: Array,
+    camera: Camera,
+    given: _Given,
+) -> PoseEstimate:
+    """What the kernel wrote, as an estimate; the arrays become its own."""
+    for array in arrays:
+        array.setflags(write=False)
+    position, rotation, cov, residual, jacobian = arrays
+    code, chi2, iterations, sharp_rows, relative_sigma = numbers
+    solved = code <= _AMBIGUOUS
+    estimate = object.__new__(PoseEstimate)  # as its constructor, at a third of the time
+    estimate.__dict__.update(
+        pose=Pose.trusted(position, rotation) if solved else None,
+        cov=cov if solved else None,
+        status=STATUS_OF_CODE[int(code)],
+        residual=residual,
+        jacobian=jacobian,
+        chi2=chi2,
+        iterations=int(iterations),
+        sharp_rows=int(sharp_rows),
+        relative_sigma=relative_sigma,
         keypoints=keypoints,
         points=points,
         camera=camera,
+        attitude_prior=given.attitude_prior,
+        position_prior=given.position_prior,
+        altitude=given.altitude,
+        lines=given.lines,
+        edges=given.edges,
     )
+    return estimate
 
 
-def _frozen(array: Array) -> Array:
-    copy = array.copy()
-    copy.setflags(write=False)
-    return copy
+def _block_diagonal(blocks: Sequence[Array]) -> Array:
+    """Covariances (N or 1, m, m) as one (N or 1, n, n)."""
+    count, size = max(len(b) for b in blocks), sum(b.shape[1] for b in blocks)
+    whole, end = np.zeros((count, size, size)), 0
+    for block in blocks:
+        begin, end = end, end + block.shape[1]
+        whole[:, begin:end, begin:end] = block
+    return whole
 
 
-# The kernels below are compiled. They work in memory the caller owns: nothing is allocated per
-# problem, and the interpreter's lock is released for the whole of a chunk.
+def _cholesky(covs: Array) -> Array:
+    """Lower Cholesky factors of (N, n, n); NaN for what is not positive definite."""
+    try:
+        return np.asarray(np.linalg.cholesky(covs))
+    except np.linalg.LinAlgError:
+        if len(covs) == 1:
+            return np.full_like(covs, np.nan)
+        return np.concatenate([_cholesky(covs[i : i + 1]) for i in range(len(covs))])
+
+
+# The kernels below are compiled. They work in memory the caller owns or in one block for the whole
+# call: nothing is allocated per problem, and the interpreter's lock is released for the whole of a
+# chunk. Arrays given to them are read-only, those they fill are not: one type of call to compile.
 
 # Scaled pivot (see _cholesky_kernel). Points on a line leave 1e-15, a 300 m runway at 60 km 1e-6.
 _SINGULAR = 1e-12
-_STEP_TOLERANCE = 1e-12  # δᵀJᵀJδ: the last step is below a millionth of a standard deviation
-_FIRST_DAMPING = 1e-4
+# The last step, or what the shrinking of the steps predicts for the next one, is below a millionth
+# of a standard deviation: δᵀJᵀJδ under this.
+_STEP_TOLERANCE = 1e-12
+_FIRST_DAMPING = 1e-3
 # Attitude known to this (rad, 1σ) rules out an optimum that hangs upside down. Measured: of 80,000
 # noisy runways none with a second optimum was known to better than 0.14 rad.
 _SURE_TURN = 0.05
+# A cost that noise exceeds once in e^16 = 9 million times (see _plausible_kernel) asks for more starts.
+_IMPLAUSIBLE = 16.0
+_LOWEST, _RIVAL, _STATUS, _STEPS, _SURE = range(5)  # of the tally of a search
+_TALLY = 5
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _solve_kernel(mean, cov, points, intrinsics, rotations, positions, max_iterations, out):  # type: ignore[no-untyped-def]
-    """N problems into `out`; `cov` and `points` have N rows or a single one, shared."""
-    k, given = points.shape[1], rotations.shape[0]
-    problem = _Problem(np.empty(2 * k), np.empty((2 * k, 2 * k)), np.empty((k, 3)), intrinsics, np.empty(k))
-    best, current, trial = _state_kernel(k), _state_kernel(k), _state_kernel(k)
-    system = _System(np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty(6), np.empty((3, 3)))
-    planar = _planar_kernel(k)
-    all_rotations, all_positions = np.empty((given + 2, 3, 3)), np.empty((given + 2, 3))
-    all_rotations[:given] = rotations
-    all_positions[:given] = positions
+class _Problem(NamedTuple):
+    """One problem; refilled for each. The kernels' tuples are small: passing one costs its length."""
+
+    points: Any  # (K, 3)
+    edges: Any  # (L, 2, 3)
+    lens: Any  # (12,)
+    priors: Any  # 0 or 1 of each: attitude, position, altitude
+    measured: Any  # (n,) pixels, lines, zeros for the attitude, position, height
+    keypoint_factor: Any  # (2K, 2K) of the covariance, as _cholesky_kernel leaves it
+    line_factor: Any  # (2L, 2L)
+    attitude_factor: Any  # (3, 3)
+    position_factor: Any  # (3, 3)
+    attitude: Any  # (3, 3) runway_from_camera of the prior
+    numbers: Any  # (2,) 1 / sigma of the altitude; whether the keypoints' coordinates are independent
+    turn: Any  # (3, 3) scratch
+    depth: Any  # (K,) scratch
+
+
+class _State(NamedTuple):
+    """A pose, the whitened residual and Jacobian there, and what follows from them."""
+
+    whole: Any  # all numbers
+    rows: Any  # those of the next four
+    rotation: Any  # (3, 3)
+    position: Any  # (3,)
+    residual: Any  # (n,)
+    jacobian: Any  # (n, 6)
+    normal: Any  # (6, 6) JᵀJ, lower triangle
+    gradient: Any  # (6,) Jᵀr
+    factor: Any  # (6, 6) of JᵀJ, damped or not, as _cholesky_kernel leaves it
+    step: Any  # (6,)
+
+
+def _work_size(k: int, lines: int, rows: int) -> int:
+    """Numbers that `_solve_kernel` works in."""
+    problem = rows + 4 * k * k + 4 * lines * lines + 9 + 9 + 9 + 2 + 9 + k
+    return problem + 3 * (96 + 7 * rows) + scratch_size(k) + _TALLY
+
+
+@kernel
+def _problem_kernel(points, edges, lens, priors, rows, work):  # type: ignore[no-untyped-def]
+    """A problem in the first part of `work`, and where that part ends."""
+    k, lines = points.shape[0], edges.shape[0]
+    a = rows + 4 * k * k
+    b = a + 4 * lines * lines
+    end = b + 38 + k
+    return _Problem(
+        points, edges, lens, priors, work[:rows], work[rows:a].reshape(2 * k, 2 * k),
+        work[a:b].reshape(2 * lines, 2 * lines), work[b : b + 9].reshape(3, 3), work[b + 9 : b + 18].reshape(3, 3),
+        work[b + 18 : b + 27].reshape(3, 3), work[b + 27 : b + 29], work[b + 29 : b + 38].reshape(3, 3),
+        work[b + 38 : end],
+    ), end  # fmt: skip
+
+
+@kernel
+def _state_kernel(work, start, rows):  # type: ignore[no-untyped-def]
+    """A state in `work` from `start` on, and where it ends."""
+    a = start + 12
+    b = a + rows
+    c = b + 6 * rows
+    end = c + 84
+    return _State(
+        work[start:end], work[start:c], work[start : start + 9].reshape(3, 3), work[start + 9 : a],
+        work[a:b], work[b:c].reshape(rows, 6), work[c : c + 36].reshape(6, 6), work[c + 36 : c + 42],
+        work[c + 42 : c + 78].reshape(6, 6), work[c + 78 : end],
+    ), end  # fmt: skip
+
+
+@kernel
+def _solve_many_kernel(  # type: ignore[no-untyped-def]
+    mean, cov, points, line_mean, line_cov, edges, attitude, position, altitude, initial, lens, max_iterations, work,
+    positions, rotations, covs, residuals, jacobians, summaries,
+):  # fmt: skip
+    """N problems; what was measured has N rows or a single one, shared."""
     for i in range(mean.shape[0]):
-        problem.mean[:] = mean[i]
-        problem.points[:] = points[min(i, points.shape[0] - 1)]
-        problem.whitener[:] = cov[min(i, cov.shape[0] - 1)]
-        status, iterations = _admit_kernel(problem), 0
-        if status == _CONVERGED:
-            starts = given + _planar_starts_kernel(problem, planar, all_rotations[given:], all_positions[given:])
-            status, iterations = _search_kernel(
-                problem, all_rotations[:starts], all_positions[:starts], best, current, trial, system, max_iterations
-            )
-        out.status_codes[i], out.iterations[i] = status, iterations
-        if status <= _AMBIGUOUS:
-            _write_kernel(problem, best, system, i, out)
+        _solve_kernel(
+            mean[i], cov[_row_kernel(i, cov)], points[_row_kernel(i, points)], line_mean[_row_kernel(i, line_mean)],
+            line_cov[_row_kernel(i, line_cov)], edges[_row_kernel(i, edges)], attitude[_row_kernel(i, attitude)],
+            position[_row_kernel(i, position)], altitude[_row_kernel(i, altitude)], initial, lens, max_iterations, work,
+            positions[i], rotations[i], covs[i], residuals[i], jacobians[i], summaries[i],
+        )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _state_kernel(k):  # type: ignore[no-untyped-def]
-    return _State(np.empty((3, 3)), np.empty(3), np.empty(2 * k), np.empty((2 * k, 6)))
+@kernel
+def _row_kernel(i, array):  # type: ignore[no-untyped-def]
+    return i if array.shape[0] > 1 else 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _planar_kernel(k):  # type: ignore[no-untyped-def]
-    square = (3, 3)
-    return _Planar(
-        np.empty((k, 4)), np.empty(square), np.empty(3), np.empty((8, 8)), np.empty(8),
-        np.empty(square), np.empty(square), np.empty(square),
-    )  # fmt: skip
+@kernel
+def _solve_kernel(  # type: ignore[no-untyped-def]
+    mean, cov, points, line_mean, line_cov, edges, attitude, position, altitude, initial, lens, max_iterations, work,
+    position_out, rotation_out, cov_out, residual_out, jacobian_out, summary,
+):  # fmt: skip
+    """One problem. The priors, and the start `initial` (0 or 1, 12), are numbers in a row; absent ones have no rows."""
+    rows = residual_out.shape[0]
+    priors = (attitude.shape[0], position.shape[0], altitude.shape[0])
+    problem, end = _problem_kernel(points, edges, lens, priors, rows, work)
+    best, end = _state_kernel(work, end, rows)
+    current, end = _state_kernel(work, end, rows)
+    trial, end = _state_kernel(work, end, rows)
+    scratch, end = carve_kernel(work, end, points.shape[0])
+    tally = work[end : end + _TALLY]
+    tally[_LOWEST], tally[_RIVAL], tally[_STATUS], tally[_STEPS], tally[_SURE] = math.inf, math.inf, 0.0, 0.0, 0.0
+    tally[_STATUS] = _admit_kernel(problem, mean, cov, line_mean, line_cov, attitude, position, altitude, initial)
+    if tally[_STATUS] == _CONVERGED:
+        _search_kernel(problem, position, initial, max_iterations, scratch, best, current, trial, tally)
+    summary[0], summary[1], summary[2] = tally[_STATUS], tally[_LOWEST], tally[_STEPS]
+    if tally[_STATUS] <= _AMBIGUOUS:
+        copy_kernel(best.position, position_out)
+        copy_kernel(best.rotation.reshape(9), rotation_out.reshape(9))
+        copy_kernel(best.residual, residual_out)
+        copy_kernel(best.jacobian.reshape(6 * rows), jacobian_out.reshape(6 * rows))
+        _covariance_kernel(best.factor, best.normal, cov_out)
+        summary[3], summary[4] = _sharpness_kernel(problem, best.position, cov_out, cov, line_cov, attitude, position)
+    else:
+        position_out[:] = math.nan
+        rotation_out[:] = math.nan
+        residual_out[:] = math.nan
+        jacobian_out[:] = math.nan
+        cov_out[:] = math.nan
+        summary[1], summary[3], summary[4] = math.nan, 0.0, math.nan
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _admit_kernel(problem):  # type: ignore[no-untyped-def]
-    """Refuse NaN, infinity and a skew covariance; replace the covariance by its Cholesky factor."""
-    for array in (problem.mean, problem.points.ravel(), problem.whitener.ravel()):
-        for value in array:
-            if not math.isfinite(value):
-                return _NON_FINITE
-    cov = problem.whitener
+@kernel
+def _admit_kernel(problem, mean, cov, line_mean, line_cov, attitude, position, altitude, initial):  # type: ignore[no-untyped-def]
+    """Take in what was measured, and factor its covariances; refuse NaN, infinity and what is no covariance."""
+    measured, row = problem.measured, 2 * (mean.shape[0] + line_mean.shape[0])
+    copy_kernel(mean.reshape(mean.size), measured)
+    copy_kernel(line_mean.reshape(line_mean.size), measured[2 * mean.shape[0] :])
+    good, independent = _factor_kernel(cov, problem.keypoint_factor)
+    problem.numbers[1] = independent
+    finite = (
+        _finite_kernel(cov) and _finite_kernel(line_cov) and _finite_kernel(problem.points) and _finite_kernel(initial)
+    )
+    finite = finite and _finite_kernel(problem.edges.reshape(2 * line_mean.shape[0], 3))
+    good = good and _factor_kernel(line_cov, problem.line_factor)[0]
+    if attitude.shape[0] > 0:
+        measured[row : row + 3] = 0.0
+        row += 3
+        finite = finite and _finite_kernel(attitude)
+        copy_kernel(attitude[0, :9], problem.attitude.reshape(9))
+        good = good and _factor_kernel(attitude[0, 9:].reshape(3, 3), problem.attitude_factor)[0]
+        good = good and _is_rotation_kernel(problem.attitude)
+    if position.shape[0] > 0:
+        copy_kernel(position[0, :3], measured[row:])
+        row += 3
+        finite = finite and _finite_kernel(position)
+        good = good and _factor_kernel(position[0, 3:].reshape(3, 3), problem.position_factor)[0]
+    if altitude.shape[0] > 0:
+        measured[row], problem.numbers[0] = altitude[0, 0], 1.0 / altitude[0, 1]
+        finite = finite and _finite_kernel(altitude)
+        good = good and altitude[0, 1] > 0.0
+    finite = finite and _finite_kernel(measured.reshape(1, measured.size))
+    if not finite:
+        return _NON_FINITE
+    return _CONVERGED if good else _ILL_CONDITIONED
+
+
+@kernel
+def _finite_kernel(rows):  # type: ignore[no-untyped-def]
+    bad = 0
+    for i in range(rows.shape[0]):
+        for j in range(rows.shape[1]):
+            bad += not abs(rows[i, j]) < math.inf
+    return bad == 0
+
+
+@kernel
+def _factor_kernel(cov, factor):  # type: ignore[no-untyped-def]
+    """The Cholesky factor of a covariance: whether there is one, and whether it is diagonal."""
+    independent = True
     for i in range(cov.shape[0]):
         for j in range(i):
-            if abs(cov[i, j] - cov[j, i]) > 1e-8 * math.sqrt(abs(cov[i, i] * cov[j, j])):
-                return _ILL_CONDITIONED
-    return _CONVERGED if _cholesky_kernel(problem.whitener) > _SINGULAR else _ILL_CONDITIONED
+            skew = cov[i, j] - cov[j, i]
+            if skew != 0.0 and not skew * skew <= 1e-16 * abs(cov[i, i] * cov[j, j]):
+                return False, False
+            independent = independent and cov[i, j] == 0.0
+            factor[i, j] = cov[i, j]
+        factor[i, i] = cov[i, i]
+    if not independent:
+        return _cholesky_kernel(factor, _SINGULAR), False
+    for i in range(cov.shape[0]):
+        if not cov[i, i] > 0.0:
+            return False, True
+        factor[i, i] = 1.0 / math.sqrt(cov[i, i])
+    return True, True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _search_kernel(problem, rotations, positions, best, current, trial, system, max_iterations):  # type: ignore[no-untyped-def]
-    """Refine the starts; the status and the iterations, with the lowest physical optimum in `best`.
+@kernel
+def _is_rotation_kernel(r):  # type: ignore[no-untyped-def]
+    """Whether the columns are orthonormal to 1e-6, and right-handed."""
+    for i in range(3):
+        for j in range(i + 1):
+            off = r[0, i] * r[0, j] + r[1, i] * r[1, j] + r[2, i] * r[2, j] - (1.0 if i == j else 0.0)
+            if not abs(off) < 1e-6:
+                return False
+    x, y, z = (
+        r[1, 0] * r[2, 1] - r[2, 0] * r[1, 1],
+        r[2, 0] * r[0, 1] - r[0, 0] * r[2, 1],
+        r[0, 0] * r[1, 1] - r[1, 0] * r[0, 1],
+    )
+    return x * r[0, 2] + y * r[1, 2] + z * r[2, 2] > 0.0
+
+
+@kernel
+def _search_kernel(problem, position, initial, max_iterations, scratch, best, current, trial, tally):  # type: ignore[no-untyped-def]
+    """Refine start after start, until one settles the matter; the lowest physical optimum is in `best`."""
+    points, rotations, positions = problem.points, scratch.rotations, scratch.positions
+    tally[_STATUS] = _NON_FINITE
+    seen = flatten_kernel(problem.measured, problem.lens, scratch.image)
+    if initial.shape[0] > 0:
+        copy_kernel(initial[0, :9], rotations[0].reshape(9))
+        copy_kernel(initial[0, 9:], positions[0])
+        _try_kernel(1, problem, max_iterations, scratch, best, current, trial, tally)
+    if problem.priors[0] > 0 and seen:
+        count = known_attitude_start_kernel(points, problem.attitude, scratch, rotations, positions)
+        _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally)
+    if points.shape[0] > 3 and seen:
+        count = planar_starts_kernel(points, scratch, rotations, positions)
+        _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally)
+    if points.shape[0] == 3 or not _settled_kernel(tally, problem):
+        _search_on_kernel(problem, position, seen, max_iterations, scratch, best, current, trial, tally)
+    if tally[_STATUS] == _CONVERGED and tally[_RIVAL] - tally[_LOWEST] < AMBIGUITY_CHI2:
+        tally[_STATUS] = _AMBIGUOUS
+
+
+@kernel
+def _search_on_kernel(problem, position, seen, max_iterations, scratch, best, current, trial, tally):  # type: ignore[no-untyped-def]
+    """The starts for three points, and for when those of the plane leave a doubt."""
+    points, rotations, positions = problem.points, scratch.rotations, scratch.positions
+    i, j, k = widest_triple_kernel(points)
+    if seen and k != i:
+        count = three_point_starts_kernel(points, i, j, k, scratch, rotations, positions)
+        _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally)
+    if seen and problem.priors[1] > 0:
+        count = known_position_start_kernel(points, position[0, :3], scratch, rotations, positions)
+        _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally)
+    if not _settled_kernel(tally, problem):
+        count = level_start_kernel(points, math.tan(math.radians(3.0)), scratch, rotations, positions)
+        _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally)
+
+
+@kernel
+def _settled_kernel(tally, problem):  # type: ignore[no-untyped-def]
+    """Whether an optimum is found that leaves no doubt: attitude well known, cost as noise explains it.
+
+    P(χ²(m) > m + 2 sqrt(m t) + 2 t) <= exp(-t) (Laurent & Massart 2000, Lemma 1).
+    """
+    dof = problem.measured.shape[0] - 6
+    most = dof + 2.0 * math.sqrt(dof * _IMPLAUSIBLE) + 2.0 * _IMPLAUSIBLE
+    return tally[_STATUS] == _CONVERGED and tally[_SURE] > 0.0 and tally[_LOWEST] < most
+
+
+@kernel
+def _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally):  # type: ignore[no-untyped-def]
+    """Refine the first `count` starts of `scratch`.
 
     IPPE's second start is, for a runway, an upside-down view, and slow to refine. Once the first
     has led to a physical optimum with well-known attitude the other cannot lead to one as well.
     """
-    status, iterations, lowest, rival, sure = _NON_FINITE, 0, math.inf, math.inf, False
-    starts = rotations.shape[0]
-    for s in range(starts + 1):
-        if s == starts:
-            if status == _CONVERGED:
-                break
-            _level_start_kernel(problem, current)
-        elif sure and not _physical_kernel(rotations[s], positions[s]):
+    for s in range(count):
+        if tally[_SURE] > 0.0 and not physical_kernel(scratch.rotations[s], scratch.positions[s]):
             continue
-        else:
-            current.rotation[:] = rotations[s]
-            current.position[:] = positions[s]
-        outcome, cost, steps = _refine_kernel(problem, current, trial, system, max_iterations)
-        status, iterations = min(status, outcome), iterations + steps
+        copy_kernel(scratch.rotations[s].reshape(9), current.rotation.reshape(9))
+        copy_kernel(scratch.positions[s], current.position)
+        outcome, cost, steps = _refine_kernel(problem, current, trial, max_iterations)
+        tally[_STATUS], tally[_STEPS] = min(tally[_STATUS], outcome), tally[_STEPS] + steps
         if outcome != _CONVERGED:
             continue
-        distinct = lowest < math.inf and _separation_kernel(system.normal, current, best) > 1.0
-        if cost < lowest:
-            rival = lowest if distinct else rival
-            lowest, sure = cost, _turn_variance_kernel(system.factor) < _SURE_TURN**2
-            best.rotation[:] = current.rotation
-            best.position[:] = current.position
+        distinct = tally[_LOWEST] < math.inf and _separation_kernel(current, best) > 1.0
+        if cost < tally[_LOWEST]:
+            if distinct:
+                tally[_RIVAL] = tally[_LOWEST]
+            tally[_LOWEST] = cost
+            tally[_SURE] = 1.0 if _turn_variance_kernel(current.factor) < _SURE_TURN**2 else 0.0
+            copy_kernel(current.whole, best.whole)
         elif distinct:
-            rival = min(rival, cost)
-    if status == _CONVERGED and rival - lowest < AMBIGUITY_CHI2:
-        status = _AMBIGUOUS
-    return status, iterations
+            tally[_RIVAL] = min(tally[_RIVAL], cost)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _turn_variance_kernel(factor):  # type: ignore[no-untyped-def]
     """Sum of the three variances of the rotation, rad².
 
-    The last rows of the factor of JᵀJ are the factor of the rotation's marginal information.
+    The last rows of the factor of JᵀJ are the factor of the rotation's marginal information. Its
+    diagonal entries are stored as their reciprocals a, c, f.
     """
     a, b, c = factor[3, 3], factor[4, 3], factor[4, 4]
     d, e, f = factor[5, 3], factor[5, 4], factor[5, 5]
-    off = (b / (a * c)) ** 2 + (e / (c * f)) ** 2 + ((b * e - c * d) / (a * c * f)) ** 2
-    return 1.0 / a**2 + 1.0 / c**2 + 1.0 / f**2 + off
+    return a * a + c * c + f * f + (b * a * c) ** 2 + (e * c * f) ** 2 + ((b * e * c - d) * a * f) ** 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _separation_kernel(normal, one, other):  # type: ignore[no-untyped-def]
+@kernel
+def _separation_kernel(one, other):  # type: ignore[no-untyped-def]
     """Squared distance of two poses, each axis in the standard deviations it has by itself."""
     total = 0.0
     for a in range(3):
-        total += normal[a, a] * (one.position[a] - other.position[a]) ** 2
+        total += one.normal[a, a] * (one.position[a] - other.position[a]) ** 2
         for b in range(3):  # |R1 - R2|² / 2 is the angle squared, for small angles
-            total += 0.5 * normal[3 + a, 3 + a] * (one.rotation[b, a] - other.rotation[b, a]) ** 2
+            total += 0.5 * one.normal[3 + a, 3 + a] * (one.rotation[b, a] - other.rotation[b, a]) ** 2
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _write_kernel(problem, best, system, i, out):  # type: ignore[no-untyped-def]
-    """The best optimum, with everything that belongs to it, into row `i`."""
-    out.chi2[i] = _evaluate_kernel(problem, best)
-    out.positions[i] = best.position
-    out.rotations[i] = best.rotation
-    out.residuals[i] = best.residual
-    out.jacobians[i] = best.jacobian
-    _normal_kernel(best.jacobian, best.residual, system.normal, system.gradient)
-    _cholesky_kernel(system.normal)
-    for column in range(6):
-        out.covs[i, column] = 0.0
-        out.covs[i, column, column] = 1.0
-        _solve_factored_kernel(system.normal, out.covs[i, column])
+@kernel
+def _covariance_kernel(factor, w, out):  # type: ignore[no-untyped-def]
+    """(JᵀJ)⁻¹ = L⁻ᵀ L⁻¹, by way of w = L⁻¹."""
+    for j in range(6):
+        w[j, j] = factor[j, j]
+        for i in range(j + 1, 6):
+            total = 0.0
+            for k in range(j, i):
+                total -= factor[i, k] * w[k, j]
+            w[i, j] = total * factor[i, i]
+    for i in range(6):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, 6):
+                total += w[k, i] * w[k, j]
+            out[i, j] = total
+            out[j, i] = total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _refine_kernel(problem, current, trial, system, max_iterations):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt from the current pose, in place: outcome, cost, iterations."""
+@kernel
+def _sharpness_kernel(problem, position, cov, keypoint_cov, line_cov, attitude, position_prior):  # type: ignore[no-untyped-def]
+    """How many rows are known better than the scale of what they measure, and the position's relative sigma.
+
+    The scale is the extent of the keypoints in the image, a radian, and the distance to the nearest point.
+    """
+    points, measured = problem.points, problem.measured
+    least_u = least_v = nearest = math.inf
+    most_u = most_v = -math.inf
+    for i in range(points.shape[0]):
+        u, v = measured[2 * i], measured[2 * i + 1]
+        least_u, most_u, least_v, most_v = min(least_u, u), max(most_u, u), min(least_v, v), max(most_v, v)
+        x, y, z = points[i, 0] - position[0], points[i, 1] - position[1], points[i, 2] - position[2]
+        nearest = min(nearest, x * x + y * y + z * z)
+    extent = max(most_u - least_u, most_v - least_v) ** 2
+    sharp = 0
+    for i in range(2 * points.shape[0]):
+        sharp += keypoint_cov[i, i] < extent
+    for i in range(line_cov.shape[0]):
+        sharp += line_cov[i, i] < (extent if i % 2 == 0 else 1.0)
+    for a in range(3):
+        sharp += problem.priors[0] > 0 and attitude[0, 9 + 4 * a] < 1.0
+        sharp += problem.priors[1] > 0 and position_prior[0, 3 + 4 * a] < nearest
+    sharp += problem.priors[2] > 0 and problem.numbers[0] ** 2 * nearest > 1.0
+    return sharp, math.sqrt((cov[0, 0] + cov[1, 1] + cov[2, 2]) / nearest)
+
+
+@kernel
+def _refine_kernel(problem, current, trial, max_iterations):  # type: ignore[no-untyped-def]
+    """Gauss-Newton from the current pose, damped where it does not descend: outcome, cost, steps."""
     cost = _evaluate_kernel(problem, current)
     if not cost < math.inf:
         return (_BEHIND_CAMERA if cost == math.inf else _NON_FINITE), cost, 0
-    _normal_kernel(current.jacobian, current.residual, system.normal, system.gradient)
-    damping, outcome, iteration = _FIRST_DAMPING, _MAX_ITERATIONS, 0
+    _normal_kernel(current)
+    damping, outcome, iteration, last = 0.0, _MAX_ITERATIONS, 0, 0.0
     while outcome == _MAX_ITERATIONS and iteration < max_iterations:
         iteration += 1
-        size = _step_kernel(system, damping)
-        _move_kernel(current, system, trial)
+        size = _step_kernel(current, damping)
+        _move_kernel(current, trial, problem.turn)
         tried = _evaluate_kernel(problem, trial)
         # The second term: below the rounding of the cost no decrease can be seen.
         if size < _STEP_TOLERANCE + 1e-15 * cost:
             outcome = _CONVERGED
         if tried < cost:
-            cost, damping = tried, 0.1 * damping
-            current.rotation[:] = trial.rotation
-            current.position[:] = trial.position
-            _normal_kernel(trial.jacobian, trial.residual, system.normal, system.gradient)
+            if size * size < _STEP_TOLERANCE * last:  # sizes are squares: the next is about size² / last
+                outcome = _CONVERGED
+            last = size if damping == 0.0 else 0.0
+            cost, damping = tried, (0.1 * damping if damping > _FIRST_DAMPING else 0.0)
+            copy_kernel(trial.rows, current.rows)
+            _normal_kernel(current)
         else:
-            damping = 10.0 * damping
-    return _judge_kernel(current, system, outcome), cost, iteration
+            last, damping = 0.0, max(10.0 * damping, _FIRST_DAMPING)
+    return _judge_kernel(current, outcome), cost, iteration
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _judge_kernel(current, system, outcome):  # type: ignore[no-untyped-def]
+@kernel
+def _judge_kernel(current, outcome):  # type: ignore[no-untyped-def]
     """What the end of a refinement is worth: is it determined, and is it physical?"""
-    system.factor[:] = system.normal
-    if not _cholesky_kernel(system.factor) > _SINGULAR:
+    copy_kernel(current.normal.reshape(36), current.factor.reshape(36))
+    if not _cholesky_kernel(current.factor, _SINGULAR):
         return _ILL_CONDITIONED
-    if outcome == _CONVERGED and not _physical_kernel(current.rotation, current.position):
+    if outcome == _CONVERGED and not physical_kernel(current.rotation, current.position):
         return _BEHIND_CAMERA
     return outcome
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _physical_kernel(rotation, position):  # type: ignore[no-untyped-def]
-    """Above the ground and upright: the image's y axis points down."""
-    return position[2] > 0.0 and rotation[2, 1] < 0.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _step_kernel(system, damping):  # type: ignore[no-untyped-def]
+@kernel
+def _step_kernel(state, damping):  # type: ignore[no-untyped-def]
     """Solve (JᵀJ + damping diag JᵀJ) δ = Jᵀr (Marquardt 1963); returns δᵀJᵀJδ."""
-    normal, factor, gradient, step = system.normal, system.factor, system.gradient, system.step
-    factor[:] = normal
-    step[:] = gradient
+    normal, factor, gradient, step = state.normal, state.factor, state.gradient, state.step
     for a in range(6):
-        factor[a, a] *= 1.0 + damping
-    if not _cholesky_kernel(factor) > 0.0:
+        for b in range(a):
+            factor[a, b] = normal[a, b]
+        factor[a, a] = (1.0 + damping) * normal[a, a]
+        step[a] = gradient[a]
+    if not _cholesky_kernel(factor, 0.0):
         step[:] = math.nan  # the trial fails and the damping grows
+        return math.nan
     _solve_factored_kernel(factor, step)
     size = 0.0
     for a in range(6):  # δᵀJᵀJδ = δᵀ(Jᵀr - damping diag(JᵀJ) δ)
@@ -537,262 +968,173 @@ def _step_kernel(system, damping):  # type: ignore[no-untyped-def]
     return size
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _move_kernel(current, system, trial):  # type: ignore[no-untyped-def]
-    """The pose moved by the step: p + δp, R exp(δθ)."""
-    exp_kernel(system.step[3:], system.turn)
-    _product_kernel(current.rotation, system.turn, trial.rotation)
+@kernel
+def _move_kernel(current, trial, turn):  # type: ignore[no-untyped-def]
+    """The pose moved by the step: p + δp, and R exp(δθ) to second order."""
+    cayley_kernel(current.step[3:], turn)
+    product_kernel(current.rotation, turn, trial.rotation)
     for a in range(3):
-        trial.position[a] = current.position[a] + system.step[a]
+        trial.position[a] = current.position[a] + current.step[a]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _evaluate_kernel(problem, state):  # type: ignore[no-untyped-def]
     """Whitened residual and Jacobian at the pose; the cost, infinite with a point behind the camera."""
-    project_kernel(
-        problem.points,
-        state.rotation,
-        state.position,
-        problem.intrinsics,
-        state.residual,
-        state.jacobian,
-        problem.depth,
-    )
-    for depth in problem.depth:
-        if not depth > 0.0:  # behind, or NaN: beyond the range of the distortion
+    rotation, position, residual, jacobian = state.rotation, state.position, state.residual, state.jacobian
+    project_kernel(problem.points, rotation, position, problem.lens, residual, jacobian, problem.depth)
+    for i in range(problem.depth.shape[0]):
+        if not problem.depth[i] > 0.0:  # behind, or NaN: beyond the range of the distortion
             return math.inf
-    return _whiten_kernel(problem.whitener, problem.mean, state.residual, state.jacobian)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _whiten_kernel(whitener, mean, residual, jacobian):  # type: ignore[no-untyped-def]
-    """L⁻¹ (mean - residual) and L⁻¹ jacobian in place, by forward substitution; the cost."""
+    row = 2 * problem.points.shape[0]
+    if problem.numbers[1] > 0.0:
+        _scale_kernel(problem.keypoint_factor, problem.measured, residual, jacobian)
+    else:
+        _whiten_kernel(problem.keypoint_factor, problem.measured, 0, residual, jacobian)
+    if row < residual.shape[0]:
+        _evaluate_more_kernel(problem, state, row)
     cost = 0.0
     for i in range(residual.shape[0]):
-        value = mean[i] - residual[i]
-        for j in range(i):
-            entry = whitener[i, j]
-            if entry != 0.0:  # mostly zero when the keypoints are independent
-                value -= entry * residual[j]
-                for c in range(6):
-                    jacobian[i, c] -= entry * jacobian[j, c]
-        scale = 1.0 / whitener[i, i]
-        residual[i] = value * scale
-        for c in range(6):
-            jacobian[i, c] *= scale
         cost += residual[i] * residual[i]
     return cost if math.isfinite(cost) else math.nan
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _normal_kernel(jacobian, residual, normal, gradient):  # type: ignore[no-untyped-def]
-    """JᵀJ and Jᵀr."""
-    for a in range(normal.shape[0]):
-        total = 0.0
-        for i in range(residual.shape[0]):
-            total += jacobian[i, a] * residual[i]
-        gradient[a] = total
-        for b in range(a + 1):
-            total = 0.0
-            for i in range(residual.shape[0]):
-                total += jacobian[i, a] * jacobian[i, b]
-            normal[a, b] = total
-            normal[b, a] = total
+@kernel
+def _evaluate_more_kernel(problem, state, row):  # type: ignore[no-untyped-def]
+    """The rows of lines and priors, from `row` on."""
+    measured, residual, jacobian = problem.measured, state.residual, state.jacobian
+    if problem.edges.shape[0] > 0:
+        for i in range(row, row + 2 * problem.edges.shape[0]):
+            residual[i] = measured[i]
+        lines_kernel(problem.edges, state.rotation, state.position, problem.lens, row, residual, jacobian)
+        _whiten_kernel(problem.line_factor, measured, row, residual, jacobian)
+        row += 2 * problem.edges.shape[0]
+    jacobian[row:] = 0.0
+    if problem.priors[0] > 0:
+        _attitude_rows_kernel(problem, state.rotation, residual[row:], jacobian[row:])
+        _whiten_kernel(problem.attitude_factor, measured, row, residual, jacobian)
+        row += 3
+    if problem.priors[1] > 0:
+        for a in range(3):
+            residual[row + a], jacobian[row + a, a] = state.position[a], 1.0
+        _whiten_kernel(problem.position_factor, measured, row, residual, jacobian)
+        row += 3
+    if problem.priors[2] > 0:
+        residual[row] = (measured[row] - state.position[2]) * problem.numbers[0]
+        jacobian[row, 2] = problem.numbers[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _cholesky_kernel(a):  # type: ignore[no-untyped-def]
-    """Lower Cholesky factor in place; the smallest scaled pivot, or -1 where there is none.
+@kernel
+def _attitude_rows_kernel(problem, rotation, predicted, jacobian):  # type: ignore[no-untyped-def]
+    """The rotation vector from the prior's attitude to this one, w = Log(R_priorᵀ R), and its Jacobian.
 
-    A pivot over its diagonal entry is 1 - R², R the multiple correlation of that unknown with those
-    before it: it has no unit, and equals the pivot of the matrix scaled to a unit diagonal.
+    That is the inverse of the right Jacobian of SO(3) at w (Forster et al. 2017, eq. 9):
+    1 + [w]x / 2 + c [w]x², c = (1 - (t/2) / tan(t/2)) / t², t = |w|.
     """
-    smallest = 1.0
-    for j in range(a.shape[0]):
-        diagonal = a[j, j]
-        for i in range(j, a.shape[0]):
+    turn = problem.turn
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for a in range(3):
+                total += problem.attitude[a, i] * rotation[a, j]
+            turn[i, j] = total
+    log_kernel(turn, predicted)
+    x, y, z = predicted[0], predicted[1], predicted[2]
+    t2 = x * x + y * y + z * z
+    t = math.sqrt(t2)
+    c = 1.0 / 12.0 + t2 / 720.0 if t < 1e-2 else (1.0 - 0.5 * t / math.tan(0.5 * t)) / t2
+    # [w]x² = w wt - t² 1
+    jacobian[0, 3], jacobian[0, 4], jacobian[0, 5] = 1.0 + c * (x * x - t2), c * x * y - 0.5 * z, c * x * z + 0.5 * y
+    jacobian[1, 3], jacobian[1, 4], jacobian[1, 5] = c * x * y + 0.5 * z, 1.0 + c * (y * y - t2), c * y * z - 0.5 * x
+    jacobian[2, 3], jacobian[2, 4], jacobian[2, 5] = c * x * z - 0.5 * y, c * y * z + 0.5 * x, 1.0 + c * (z * z - t2)
+
+
+@kernel
+def _scale_kernel(factor, measured, residual, jacobian):  # type: ignore[no-untyped-def]
+    """_whiten_kernel for a diagonal factor, from the first row on."""
+    for i in range(factor.shape[0]):
+        scale = factor[i, i]
+        residual[i] = (measured[i] - residual[i]) * scale
+        for c in range(6):
+            jacobian[i, c] *= scale
+
+
+@kernel
+def _whiten_kernel(factor, measured, first, residual, jacobian):  # type: ignore[no-untyped-def]
+    """L⁻¹ (measured - residual) and L⁻¹ jacobian in place, rows from `first` on, by forward substitution."""
+    for i in range(factor.shape[0]):
+        row = first + i
+        # Sums in scalars: the compiler cannot tell that rows of one array do not overlap.
+        r, scale = measured[row] - residual[row], factor[i, i]
+        a, b, c = jacobian[row, 0], jacobian[row, 1], jacobian[row, 2]
+        d, e, f = jacobian[row, 3], jacobian[row, 4], jacobian[row, 5]
+        for j in range(i):
+            entry, above = factor[i, j], first + j
+            r -= entry * residual[above]
+            a -= entry * jacobian[above, 0]
+            b -= entry * jacobian[above, 1]
+            c -= entry * jacobian[above, 2]
+            d -= entry * jacobian[above, 3]
+            e -= entry * jacobian[above, 4]
+            f -= entry * jacobian[above, 5]
+        residual[row] = r * scale
+        jacobian[row, 0], jacobian[row, 1], jacobian[row, 2] = a * scale, b * scale, c * scale
+        jacobian[row, 3], jacobian[row, 4], jacobian[row, 5] = d * scale, e * scale, f * scale
+
+
+@kernel
+def _normal_kernel(state):  # type: ignore[no-untyped-def]
+    """JᵀJ and Jᵀr."""
+    jacobian, residual = state.jacobian, state.residual
+    for row in range(6):
+        a = b = c = d = e = f = g = 0.0
+        for i in range(residual.shape[0]):
+            value = jacobian[i, row]
+            a += value * jacobian[i, 0]
+            b += value * jacobian[i, 1]
+            c += value * jacobian[i, 2]
+            d += value * jacobian[i, 3]
+            e += value * jacobian[i, 4]
+            f += value * jacobian[i, 5]
+            g += value * residual[i]
+        normal = state.normal
+        normal[row, 0], normal[row, 1], normal[row, 2] = a, b, c
+        normal[row, 3], normal[row, 4], normal[row, 5] = d, e, f
+        state.gradient[row] = g
+
+
+@kernel
+def _cholesky_kernel(a, least):  # type: ignore[no-untyped-def]
+    """Lower Cholesky factor in place, with 1 / its diagonal on the diagonal; False where there is none.
+
+    None, too, where a scaled pivot is `least` or under. A pivot over its diagonal entry is 1 - R², R
+    the multiple correlation of that unknown with those before it: it has no unit, and equals the
+    pivot of the matrix scaled to a unit diagonal.
+    """
+    for i in range(a.shape[0]):
+        pivot = a[i, i]
+        for j in range(i):
             total = a[i, j]
             for k in range(j):
                 total -= a[i, k] * a[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return -1.0
-                smallest = min(smallest, total / diagonal)
-                a[j, j] = math.sqrt(total)
-            else:
-                a[i, j] = total / a[j, j]
-        for i in range(j):
-            a[i, j] = 0.0
-    return smallest
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _solve_factored_kernel(factor, x):  # type: ignore[no-untyped-def]
-    """Solve L Lᵀ x = b in place."""
-    n = x.shape[0]
-    for i in range(n):
-        for j in range(i):
-            x[i] -= factor[i, j] * x[j]
-        x[i] /= factor[i, i]
-    for i in range(n - 1, -1, -1):
-        for j in range(i + 1, n):
-            x[i] -= factor[j, i] * x[j]
-        x[i] /= factor[i, i]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _product_kernel(a, b, out):  # type: ignore[no-untyped-def]
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _level_start_kernel(problem, state):  # type: ignore[no-untyped-def]
-    """The last resort: level, on a 3° glide path, as far off as the points' width in view tells."""
-    points, mean = problem.points, problem.mean
-    slope = math.tan(math.radians(3.0))
-    across = np.std(points[:, 1]) + slope * np.std(points[:, 0])
-    in_view = (np.std(mean[0::2]) + np.std(mean[1::2])) / problem.intrinsics[0]
-    distance = min(max(across / max(in_view, 1e-9), 1.0), 1e5)
-    state.rotation[:] = BODY_FROM_CAMERA
-    state.position[0] = points[:, 0].min() - distance
-    state.position[1] = points[:, 1].mean()
-    state.position[2] = points[:, 2].mean() + distance * slope
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _planar_starts_kernel(problem, w, rotations, positions):  # type: ignore[no-untyped-def]
-    """IPPE's two poses of the points' plane (Collins & Bartoli 2014) as starts; how many (0 or 2).
-
-    From the homography's value (p, q) and Jacobian at the centre: turn the optical axis on to the
-    ray to the centre, and what is left of the Jacobian is a scaled 2 x 2 block of a rotation, which
-    has two completions.
-    """
-    if not (_plane_kernel(problem.points, w) and _flatten_kernel(problem, w.flat)):
-        return 0
-    p, q, j00, j01, j10, j11 = _homography_kernel(w.flat, w.normal, w.coefficients)
-    _ray_kernel(p, q, w.turn)
-    b00, b01 = w.turn[0, 0] - p * w.turn[2, 0], w.turn[0, 1] - p * w.turn[2, 1]
-    b10, b11 = w.turn[1, 0] - q * w.turn[2, 0], w.turn[1, 1] - q * w.turn[2, 1]
-    det = b00 * b11 - b01 * b10
-    a00, a01 = (b11 * j00 - b01 * j10) / det, (b11 * j01 - b01 * j11) / det
-    a10, a11 = (b00 * j10 - b10 * j00) / det, (b00 * j11 - b10 * j01) / det
-    square = a00 * a00 + a01 * a01 + a10 * a10 + a11 * a11
-    spread = math.sqrt(max(square * square - 4.0 * (a00 * a11 - a01 * a10) ** 2, 0.0))
-    gain = math.sqrt(0.5 * (square + spread))  # largest singular value: 1 / depth of the centre
-    if not 0.0 < gain < math.inf:
-        return 0
-    a00, a01, a10, a11 = a00 / gain, a01 / gain, a10 / gain, a11 / gain
-    z0 = math.sqrt(max(1.0 - a00 * a00 - a10 * a10, 0.0))
-    z1 = math.copysign(math.sqrt(max(1.0 - a01 * a01 - a11 * a11, 0.0)), -(a00 * a01 + a10 * a11))
-    for s, sign in ((0, 1.0), (1, -1.0)):
-        _basis_kernel(a00, a10, sign * z0, a01, a11, sign * z1, w.tilt)
-        _product_kernel(w.turn, w.tilt, w.camera_from_plane)
-        _product_kernel(w.runway_from_plane, w.camera_from_plane.T, rotations[s])
-        for a in range(3):
-            centre = rotations[s, a, 0] * p + rotations[s, a, 1] * q + rotations[s, a, 2]
-            positions[s, a] = w.centre[a] - centre / gain
-    if _physical_kernel(rotations[1], positions[1]):  # the physical one first
-        for a in range(3):
-            positions[0, a], positions[1, a] = positions[1, a], positions[0, a]
-            for b in range(3):
-                rotations[0, a, b], rotations[1, a, b] = rotations[1, a, b], rotations[0, a, b]
-    return 2
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _ray_kernel(p, q, out):  # type: ignore[no-untyped-def]
-    """The smallest turn that takes (0, 0, 1) to the direction of (p, q, 1), smooth at p = q = 0."""
-    z = 1.0 / math.sqrt(1.0 + p * p + q * q)
-    x, y = p * z, q * z
-    out[0, 0], out[0, 1], out[0, 2] = 1.0 - x * x / (1.0 + z), -x * y / (1.0 + z), x
-    out[1, 0], out[1, 1], out[1, 2] = -x * y / (1.0 + z), 1.0 - y * y / (1.0 + z), y
-    out[2, 0], out[2, 1], out[2, 2] = -x, -y, z
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _plane_kernel(points, w):  # type: ignore[no-untyped-def]
-    """The plane z = a x + b y + c nearest the points: centre, axes, coordinates. False for a line."""
-    centre, axes = w.centre, w.runway_from_plane
-    sxx = sxy = syy = sxz = syz = 0.0
-    for a in range(3):
-        centre[a] = points[:, a].mean()
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-        sxx, sxy, syy, sxz, syz = sxx + x * x, sxy + x * y, syy + y * y, sxz + x * z, syz + y * z
-    det = sxx * syy - sxy * sxy
-    if not det > 1e-10 * sxx * syy:
-        return False
-    _basis_kernel(1.0, 0.0, (syy * sxz - sxy * syz) / det, 0.0, 1.0, (sxx * syz - sxy * sxz) / det, axes)
-    for i in range(points.shape[0]):
-        for column in range(2):
-            total = 0.0
-            for a in range(3):
-                total += axes[a, column] * (points[i, a] - centre[a])
-            w.flat[i, column] = total
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _basis_kernel(x0, x1, x2, y0, y1, y2, out):  # type: ignore[no-untyped-def]
-    """A right-handed orthonormal basis as columns: the first along x, the second towards y."""
-    n = 1.0 / math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
-    x0, x1, x2 = x0 * n, x1 * n, x2 * n
-    z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
-    n = 1.0 / math.sqrt(z0 * z0 + z1 * z1 + z2 * z2)
-    z0, z1, z2 = z0 * n, z1 * n, z2 * n
-    out[0, 0], out[1, 0], out[2, 0] = x0, x1, x2
-    out[0, 1], out[1, 1], out[2, 1] = z1 * x2 - z2 * x1, z2 * x0 - z0 * x2, z0 * x1 - z1 * x0
-    out[0, 2], out[1, 2], out[2, 2] = z0, z1, z2
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _flatten_kernel(problem, flat):  # type: ignore[no-untyped-def]
-    """Undistorted image coordinates of the keypoints; False where the lens model has none."""
-    for i in range(flat.shape[0]):
-        x, y, ok = normalise_kernel(problem.mean[2 * i], problem.mean[2 * i + 1], problem.intrinsics)
-        if not ok:
+            total *= a[j, j]
+            a[i, j] = total
+            pivot -= total * total
+        if not (pivot > 0.0 and pivot > least * a[i, i]):
             return False
-        flat[i, 2], flat[i, 3] = x, y
+        a[i, i] = 1.0 / math.sqrt(pivot)
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _homography_kernel(flat, a, h):  # type: ignore[no-untyped-def]
-    """Plane to image, by least squares: its value (p, q) and Jacobian (4 entries) at the centre.
-
-    Coordinates are scaled to unit size first, and the image's are centred: a runway is a hundred
-    times longer than wide, and normal equations square such numbers. The ninth entry is set to 1;
-    it is the depth of the centre, which no camera that sees the points has at 0.
-    """
-    s, t, u, v = _size_kernel(flat[:, 0]), _size_kernel(flat[:, 1]), _size_kernel(flat[:, 2]), _size_kernel(flat[:, 3])
-    u0, v0 = flat[:, 2].mean(), flat[:, 3].mean()
-    a[:] = 0.0
-    h[:] = 0.0
-    for i in range(2 * flat.shape[0]):
-        point, axis = flat[i // 2], i % 2
-        x, y = point[0] / s, point[1] / t
-        value = (point[3] - v0) / v if axis else (point[2] - u0) / u
-        # One equation: (x, y, 1) in its axis' columns, then (-value x, -value y).
-        columns = (3 * axis, 3 * axis + 1, 3 * axis + 2, 6, 7)
-        entries = (x, y, 1.0, -value * x, -value * y)
-        for m in range(5):
-            h[columns[m]] += entries[m] * value
-            for n in range(m + 1):
-                a[columns[m], columns[n]] += entries[m] * entries[n]
-    if not _cholesky_kernel(a) > 0.0:
-        h[:] = math.nan
-    _solve_factored_kernel(a, h)
-    j00, j01 = (h[0] - h[2] * h[6]) * u / s, (h[1] - h[2] * h[7]) * u / t
-    j10, j11 = (h[3] - h[5] * h[6]) * v / s, (h[4] - h[5] * h[7]) * v / t
-    return u0 + u * h[2], v0 + v * h[5], j00, j01, j10, j11
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _size_kernel(x):  # type: ignore[no-untyped-def]
-    """Standard deviation, kept from zero."""
-    mean, total = x.mean(), 0.0
-    for value in x:
-        total += (value - mean) ** 2
-    return max(math.sqrt(total / x.shape[0]), 1e-12)
+@kernel
+def _solve_factored_kernel(factor, x):  # type: ignore[no-untyped-def]
+    """Solve L Lᵀ x = b in place, for six unknowns."""
+    for i in range(6):
+        total = x[i]
+        for j in range(i):
+            total -= factor[i, j] * x[j]
+        x[i] = total * factor[i, i]
+    for i in range(5, -1, -1):
+        total = x[i]
+        for j in range(i + 1, 6):
+            total -= factor[j, i] * x[j]
+        x[i] = total * factor[i, i]

@@ -20,6 +20,17 @@ Array = NDArray[np.float64]
 _LONGEST_M = 1e5
 DATABASE_VARIABLE = "SHORTFINAL_RUNWAYS"
 
+# ICAO Annex 14 vol. I, Table 5-1, of ranges the least: from which landing distance on, where the
+# marking begins, width of a stripe, space between the stripes. A length of 45 m lies in every range.
+_AIMING_POINT_M = (
+    (2400.0, 400.0, 6.0, 18.0),
+    (1200.0, 300.0, 6.0, 18.0),
+    (800.0, 250.0, 6.0, 9.0),
+    (0.0, 150.0, 4.0, 6.0),
+)
+_STRIPE_LENGTH_M = 45.0
+_MARGIN_M = 2.0  # from the edge; the renderer keeps it as well
+
 
 @dataclass(frozen=True, eq=False)
 class Runway:
@@ -44,6 +55,33 @@ class Runway:
         flat = [[0, half, 0], [0, -half, 0], [self.length_m, -half, 0], [self.length_m, half, 0]]
         given: ArrayLike = flat if self.corners is None else self.corners
         object.__setattr__(self, "corners", as_array(given, (4, 3), "corners"))
+
+    @property
+    def edges(self) -> Array:
+        """Left and right edge (2, 2, 3), metres: of each the near end, then the far one."""
+        near_left, near_right, far_right, far_left = self.corners
+        edges: Array = np.array([[near_left, far_left], [near_right, far_right]])
+        return edges
+
+    @property
+    def aiming_point(self) -> Array:
+        """Outer corners (4, 3) of the aiming-point marking, metres, in the order of the runway's corners.
+
+        By ICAO Annex 14 for a landing distance of `length_m`, on the surface between the corners, and
+        no nearer to the edges than the width allows. What is painted may differ: real markings stand
+        at the visual slope indicator where there is one. Raises InputError for a runway too small.
+        """
+        begin, width, space = next(row[1:] for row in _AIMING_POINT_M if self.length_m >= row[0])
+        half = min(space / 2 + width, self.width_m / 2 - _MARGIN_M)
+        if half <= space / 2 or begin + _STRIPE_LENGTH_M > self.length_m:
+            raise InputError(
+                f"runway {self.ident}: {self.length_m:.0f} m by {self.width_m:.0f} m has no room for an aiming point"
+            )
+        along = np.array([0, 0, 1, 1])[:, None] * _STRIPE_LENGTH_M / self.length_m + begin / self.length_m
+        leftward = 0.5 + np.array([1, -1, -1, 1])[:, None] * half / self.width_m
+        near_left, near_right, far_right, far_left = self.corners
+        left, right = near_left + along * (far_left - near_left), near_right + along * (far_right - near_right)
+        return right + leftward * (left - right)
 
     @classmethod
     def from_corners_wgs84(cls, corners: ArrayLike, ident: str = "") -> Runway:

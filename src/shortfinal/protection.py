@@ -1,0 +1,889 @@
+"""How large an error could still hide? Protection levels: P(|error| > level and the frame was
+accepted) ≤ the integrity risk, for each axis by itself, in the worst case over the stated faults.
+
+A fault hypothesis is a set S of features with an arbitrary bias f on their rows. In the whitened
+linear model the residual is P (n + A f), with A = L⁻¹ E_S and P = 1 - J J⁺, and an axis with
+gradient a errs by s·(n + A f), s = J (JᵀJ)⁻¹ a, independently of the residual and with σ = |s|. Both
+methods rest on one number for each set and axis, g² = sᵀA (AᵀPA)⁻¹ Aᵀs. It is the slope of the
+error over the root of the statistic's non-centrality in the worst direction of f, and it is the
+standard deviation of the separation of the estimates with and without S (Joerger, Chan & Pervan
+2014, NAVIGATION 61(4), Solution separation versus residual-based RAIM).
+
+A range goes as one over an angle, so that slopes taken at the estimate are wrong by the share that
+the level has of the distance. They are therefore taken a second time, half-way to the truth that an
+error of that size would mean: that is right to second order. The equations as coded, the
+assumptions and the limits: docs/integrity.md. Frames, axes, units: docs/architecture.md.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.special import chdtri, gammainc, gammaln
+
+from shortfinal.errors import InputError
+from shortfinal.features import Feature
+from shortfinal.geometry import cayley_kernel, lines_kernel, product_kernel, project_kernel
+from shortfinal.integrity import FALSE_ALARM_RATE, check_rate
+from shortfinal.pose import CHUNK, PoseEstimate, PoseEstimateBatch, SolverStatus
+
+Array = NDArray[np.float64]
+Value = TypeVar("Value")
+
+INTEGRITY_RISK = 1e-7
+FAULT_PRIOR = 1e-4
+METHODS = ("residual", "solution-separation")
+GLIDE_PATH_ORIGIN_M = 300.0  # past the threshold: where an ILS glide path meets the runway
+SENSORS = ("attitude prior", "position prior", "altitude")  # faulty only where a mapping says so
+NO_FAULT, TOO_MANY_FAULTS = "no fault", "more faults than max_faults"
+
+
+class PerAxis(NamedTuple, Generic[Value]):
+    """One value for each axis."""
+
+    along_m: Value  # x of the runway frame
+    cross_m: Value  # y
+    vertical_m: Value  # z
+    lateral_deg: Value  # of the camera from the centreline, at a localizer on the runway's far end
+    vertical_deg: Value  # of the camera from the horizon, at the glide path's origin
+
+
+AXES = PerAxis._fields
+
+
+@dataclass(frozen=True)
+class AlertLimits:
+    """The largest error that an operation tolerates, per axis; infinite where it does not care.
+
+    Raises InputError for a limit that is not positive.
+    """
+
+    along_m: float = math.inf
+    cross_m: float = math.inf
+    vertical_m: float = math.inf
+    lateral_deg: float = math.inf
+    vertical_deg: float = math.inf
+
+    def __post_init__(self) -> None:
+        for axis in AXES:
+            if not getattr(self, axis) > 0:
+                raise InputError(f"{axis}: an alert limit of {getattr(self, axis)} is never kept; give a positive one")
+
+    @classmethod
+    def lpv200(cls) -> AlertLimits:
+        """As for LPV-200 approaches (ICAO Annex 10, Table 3.7.2.4-1): 40 m horizontally, 35 m vertically."""
+        return cls(along_m=40.0, cross_m=40.0, vertical_m=35.0)
+
+
+@dataclass(frozen=True)
+class Availability:
+    """Whether all levels are within their alert limits, and which are not. True as a condition when available."""
+
+    available: bool
+    reasons: tuple[str, ...]  # one for each axis that exceeds
+
+    def __bool__(self) -> bool:
+        return self.available
+
+
+@dataclass(frozen=True, eq=False)
+class ProtectionLevels:
+    """What bounds the error of an accepted frame, and why it is that large.
+
+    A level that cannot be given is infinite, with its reason in words.
+    """
+
+    along_m: float
+    cross_m: float
+    vertical_m: float
+    lateral_deg: float
+    vertical_deg: float
+    first_order: PerAxis[float]  # the levels with the slopes at the estimate alone
+    sigma: PerAxis[float]  # standard deviation without a fault, first-order
+    driver: PerAxis[str]  # the hypothesis that contributes most
+    reasons: tuple[str, ...]  # why a level is infinite; empty when none is
+    method: str
+    integrity_risk: float
+    false_alarm_rate: float
+    fault_prior: float | Mapping[str, float]
+    max_faults: int
+    unmonitored: float  # P(more than max_faults faults), charged to the integrity risk
+    hypotheses: tuple[str, ...]  # h sets of faulty features
+    slopes: Array  # (h, 5) g, metres and degrees; infinite where a fault can hide
+    separations: Array | None  # (h, 5) the estimate less that without the features, metres and degrees
+    thresholds: Array | None  # (h, 5) how much of it solution separation tolerates
+    passed: bool | None  # solution separation's own monitor; None with "residual", whose is check_integrity
+
+    @property
+    def levels(self) -> PerAxis[float]:
+        """The five levels."""
+        return PerAxis(self.along_m, self.cross_m, self.vertical_m, self.lateral_deg, self.vertical_deg)
+
+    def available(self, limits: AlertLimits) -> Availability:
+        """Are all levels within the alert limits?"""
+        reasons = tuple(
+            f"{axis}: level {level:.3g} over the limit {getattr(limits, axis):.3g}, driven by {driver}"
+            for axis, level, driver in zip(AXES, self.levels, self.driver, strict=True)
+            if not level <= getattr(limits, axis)
+        )
+        return Availability(not reasons, reasons)
+
+
+@dataclass(frozen=True, eq=False)
+class ProtectionBatch:
+    """The levels of N estimates; infinite where there is no estimate, or no level."""
+
+    along_m: Array  # (N,)
+    cross_m: Array
+    vertical_m: Array
+    lateral_deg: Array
+    vertical_deg: Array
+    first_order: Array  # (N, 5) in the order of AXES, as in ProtectionLevels
+    sigma: Array  # (N, 5)
+    drivers: NDArray[np.int64]  # (N, 5) index into `hypotheses`; -1 no fault, -2 more faults than max_faults
+    hypotheses: tuple[str, ...]
+    passed: NDArray[np.bool_] | None  # (N,) solution separation's own monitor; None with "residual"
+
+    def __len__(self) -> int:
+        return len(self.along_m)
+
+    @property
+    def levels(self) -> Array:
+        """The levels (N, 5), in the order of AXES."""
+        return np.stack([getattr(self, axis) for axis in AXES], axis=1)
+
+    def available(self, limits: AlertLimits) -> NDArray[np.bool_]:
+        """Which estimates (N,) have all levels within the alert limits."""
+        return np.asarray((self.levels <= [getattr(limits, axis) for axis in AXES]).all(axis=1))
+
+
+def protection_levels(
+    est: PoseEstimate,
+    *,
+    integrity_risk: float = INTEGRITY_RISK,
+    fault_prior: float | Mapping[str, float] = FAULT_PRIOR,
+    false_alarm_rate: float = FALSE_ALARM_RATE,
+    method: str = "residual",
+    max_faults: int = 1,
+) -> ProtectionLevels:
+    """Levels with P(|error| > level and the frame was accepted) ≤ `integrity_risk`, per axis.
+
+    `fault_prior` is the probability that a feature is faulty: one for every keypoint and line, or a
+    mapping from names of features (others are never faulty). Features fail independently. All sets
+    of up to `max_faults` features are protected; the probability of more is charged to the risk. So
+    is that of a set whose bias can hide completely, as with four corners that of any two: where the
+    risk does not suffice for it, the level is infinite.
+
+    "residual" (default) is the exact worst case of the χ² test, and holds for frames that
+    `check_integrity` accepts at `false_alarm_rate`. "solution-separation" holds for frames whose
+    `passed` is true; `false_alarm_rate` is then that of the test of one axis.
+
+    Raises InputError for a risk, rate or prior outside (0, 1), a feature or method that does not
+    exist, a `max_faults` that is no positive whole number, an estimate without pose or redundancy.
+    """
+    monitor = _monitor(est.dof, integrity_risk, false_alarm_rate, method)
+    if est.pose is None:
+        raise InputError(f"est: no pose to protect: the solver ended {est.status.value}")
+    plan = _plan(_feature_key(est.features), _prior_key(fault_prior), max_faults)
+    details, out = _Details(*np.empty((3, 1, len(plan.names), 5))), np.empty((1, 5, 5))
+    frames = _Frames(
+        # Copies: read-only arrays are another type to the compiler, and would be compiled for anew.
+        est.residual[None].copy(),
+        est.jacobian[None].copy(),
+        est.factor[None].copy(),
+        est.pose.position_m[None].copy(),
+        est.pose.runway_from_camera[None].copy(),
+        est.points[None].copy(),
+        _NO_EDGES if est.edges is None else est.edges[None].copy(),
+        _NO_LINES if est.lines is None else est.lines.mean[None].copy(),
+    )
+    _protect_kernel(frames, est.camera.intrinsics.copy(), plan.hypotheses, monitor, details, out)
+    levels, first_order, sigma, drivers, passed = out[0].tolist()
+    separation = method == METHODS[1]
+    return ProtectionLevels(
+        *levels,
+        first_order=PerAxis(*first_order),
+        sigma=PerAxis(*sigma),
+        driver=PerAxis(*[plan.names[int(d)] if d >= 0 else (NO_FAULT, TOO_MANY_FAULTS)[int(-1 - d)] for d in drivers]),
+        reasons=() if max(levels) < math.inf else _reasons(first_order, levels, plan, details.slopes[0]),
+        method=method,
+        integrity_risk=integrity_risk,
+        false_alarm_rate=false_alarm_rate,
+        fault_prior=fault_prior,
+        max_faults=max_faults,
+        unmonitored=plan.hypotheses.unmonitored,
+        hypotheses=plan.names,
+        slopes=details.slopes[0],
+        separations=details.separations[0] if separation else None,
+        thresholds=details.thresholds[0] if separation else None,
+        passed=est.status is SolverStatus.CONVERGED and min(passed) > 0 if separation else None,
+    )
+
+
+def protection_levels_batch(
+    batch: PoseEstimateBatch,
+    *,
+    integrity_risk: float = INTEGRITY_RISK,
+    fault_prior: float | Mapping[str, float] = FAULT_PRIOR,
+    false_alarm_rate: float = FALSE_ALARM_RATE,
+    method: str = "residual",
+    max_faults: int = 1,
+    threads: int | None = None,
+) -> ProtectionBatch:
+    """`protection_levels` of N estimates, on `threads` threads (default: one per processor).
+
+    An estimate without a pose has infinite levels. Raises as `protection_levels`.
+    """
+    monitor = _monitor(batch.dof, integrity_risk, false_alarm_rate, method)
+    plan = _plan(_feature_key(batch.features), _prior_key(fault_prior), max_faults)
+    count, intrinsics, out = len(batch), batch.camera.intrinsics.copy(), np.empty((len(batch), 5, 5))
+    frames = _Frames(
+        batch.residuals, batch.jacobians, batch.factors.copy(), batch.positions, batch.rotations,
+        batch.points, batch.edges, batch.line_mean,
+    )  # fmt: skip
+
+    def protect(start: int) -> None:
+        part = slice(start, start + CHUNK)
+        _protect_kernel(
+            _Frames(*(array[part] if len(array) == count else array for array in frames)),
+            intrinsics,
+            plan.hypotheses,
+            monitor,
+            _Details(*np.empty((3, 1, len(plan.names), 5))),  # shared by all: scratch
+            out[part],
+        )
+
+    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+        list(pool.map(protect, range(0, count, CHUNK)))
+    passed = batch.converged & (out[:, 4] > 0).all(axis=1) if method == METHODS[1] else None
+    return ProtectionBatch(*out[:, 0].T, out[:, 1], out[:, 2], out[:, 3].astype(np.int64), plan.names, passed)
+
+
+class _Frames(NamedTuple):
+    """N estimates; (1, ...) where all share one."""
+
+    residuals: Any  # (N, n)
+    jacobians: Any  # (N, n, 6)
+    factors: Any  # (N or 1, n, n)
+    positions: Any  # (N, 3)
+    rotations: Any  # (N, 3, 3)
+    points: Any  # (N or 1, K, 3)
+    edges: Any  # (N or 1, L, 2, 3)
+    lines: Any  # (N or 1, L, 2) as measured
+
+
+class _Details(NamedTuple):
+    """What the kernel finds per hypothesis and axis, (N or 1, h, 5)."""
+
+    slopes: Any
+    separations: Any
+    thresholds: Any
+
+
+class _Monitor(NamedTuple):
+    """The risk, and the test that the promise is conditional on."""
+
+    risk: float
+    false_alarm_rate: float
+    separation: bool  # solution separation instead of the χ² test
+    root: float  # of the χ² test's threshold
+    acceptance: Array  # see _acceptance
+
+
+class _Hypotheses(NamedTuple):
+    """h sets of faulty features."""
+
+    rows: NDArray[np.int64]  # (h, m) of each set, filled up with -1
+    priors: Array  # (h,) P(all of the set are faulty): a little over P(exactly these are)
+    fault_free: float  # P(no fault)
+    unmonitored: float  # P(more than max_faults)
+
+
+class _Plan(NamedTuple):
+    names: tuple[str, ...]
+    hypotheses: _Hypotheses
+
+
+_NO_EDGES, _NO_LINES = np.empty((1, 0, 2, 3)), np.empty((1, 0, 2))
+
+
+@lru_cache(maxsize=256)
+def _monitor(dof: int, risk: float, rate: float, method: str) -> _Monitor:
+    check_rate(risk, "integrity_risk")
+    check_rate(rate, "false_alarm_rate")
+    if method not in METHODS:
+        raise InputError(f"method: {method!r} is unknown; choose {' or '.join(METHODS)}")
+    if dof <= 0:
+        raise InputError(f"est: no redundancy ({dof} degrees of freedom): no fault can show; add points or sensors")
+    return _Monitor(risk, rate, method == METHODS[1], math.sqrt(chdtri(dof, rate)), _acceptance(dof, rate))
+
+
+def _feature_key(features: tuple[Feature, ...]) -> tuple[tuple[str, int, int], ...]:
+    return tuple([(name, rows.start, rows.stop) for name, rows in features])
+
+
+def _prior_key(fault_prior: float | Mapping[str, float]) -> float | tuple[tuple[str, float], ...]:
+    return tuple(fault_prior.items()) if isinstance(fault_prior, Mapping) else fault_prior
+
+
+@lru_cache(maxsize=256)
+def _plan(
+    features: tuple[tuple[str, int, int], ...], prior: float | tuple[tuple[str, float], ...], max_faults: int
+) -> _Plan:
+    if isinstance(max_faults, bool) or not isinstance(max_faults, int) or max_faults < 1:
+        raise InputError(f"max_faults: {max_faults!r}; give a whole number from 1")
+    rows = {name: range(start, stop) for name, start, stop in features}
+    priors = dict(prior) if isinstance(prior, tuple) else {name: prior for name in rows if name not in SENSORS}
+    for name, value in priors.items():
+        if name not in rows:
+            raise InputError(f"fault_prior: {name!r} was not measured; there are {', '.join(rows)}")
+        check_rate(value, f"fault_prior of {name}")
+    sets = [s for size in range(1, max_faults + 1) for s in combinations(priors, size)]
+    lists = [[row for name in s for row in rows[name]] for s in sets]
+    table = np.full((len(sets), max(map(len, lists), default=0)), -1)
+    for line, entries in zip(table, lists, strict=True):
+        line[: len(entries)] = entries
+    counts = np.ones(1)  # P(0, 1, 2, ... faults), Poisson-binomial
+    for value in priors.values():
+        counts = np.convolve(counts, [1.0 - value, value])
+    products = np.array([math.prod(priors[name] for name in s) for s in sets])
+    unmonitored = float(counts[max_faults + 1 :].sum())
+    return _Plan(tuple(" + ".join(s) for s in sets), _Hypotheses(table, products, float(counts[0]), unmonitored))
+
+
+def _reasons(first_order: list[float], levels: list[float], plan: _Plan, slopes: Array) -> tuple[str, ...]:
+    reasons = []
+    for axis, first, level, slope in zip(AXES, first_order, levels, slopes.T, strict=True):
+        if first < level == math.inf:
+            reasons.append(f"{axis}: no level: to first order {first:.3g}, too much for a bound to second order")
+        elif level == math.inf:
+            hidden = np.flatnonzero(~np.isfinite(slope))
+            spent = f"{plan.hypotheses.unmonitored:.2g} for more faults than max_faults"
+            if len(hidden):
+                total, one = plan.hypotheses.priors[hidden].sum(), plan.names[hidden[0]]
+                spent += f" and {total:.2g} for faults that can hide completely ({one}, ...)"
+            reasons.append(f"{axis}: no level: the integrity risk is less than {spent}")
+    return tuple(reasons)
+
+
+_STEP = 0.03  # of the table below: to the fourth power over 384, the error of its logarithm
+_REACH = 38.0  # P(N(0, 1) > 38) is no number any more
+
+
+@lru_cache(maxsize=64)
+def _acceptance(dof: int, rate: float) -> Array:
+    """log P(χ²(dof, t²) ≤ threshold) as cubic pieces (cells, 4) over t = 0, _STEP, ...
+
+    A Poisson mixture of central χ²: no term is negative, so that it is exact far out as well.
+    """
+    half = 0.5 * float(chdtri(dof, rate))
+    t = np.arange(0.0, math.sqrt(2.0 * half) + _REACH, _STEP)
+    # Terms fall off beyond the larger of half the threshold and t √half / √2, where they are largest.
+    largest = t[-1] * math.sqrt(0.5 * half) + half
+    j = np.arange(largest + 20.0 * math.sqrt(largest) + 60.0)
+    a = 0.5 * dof + j
+    with np.errstate(divide="ignore"):  # log 0 far out in j
+        poisson = j * np.log(np.maximum(0.5 * t * t, 1e-300))[:, None] - 0.5 * (t * t)[:, None] - gammaln(j + 1.0)
+        value = _log_sum(poisson + np.log(gammainc(a, half)))
+    # By t²: minus half the density with two more degrees of freedom.
+    density = _log_sum(poisson + a * math.log(half) - half - gammaln(a + 1.0) - math.log(2.0))
+    slope, rise = -2.0 * t * np.exp(density - value) * _STEP, np.diff(value)
+    c2, c3 = 3.0 * rise - 2.0 * slope[:-1] - slope[1:], slope[:-1] + slope[1:] - 2.0 * rise
+    return np.stack([value[:-1], slope[:-1], c2, c3], axis=1)
+
+
+def _log_sum(logs: Array) -> Array:
+    """log Σ exp over the last axis."""
+    top = logs.max(axis=-1, keepdims=True)
+    return np.asarray(top[..., 0] + np.log(np.exp(logs - top).sum(axis=-1)))
+
+
+# The kernels below are compiled. Memory is allocated once a call.
+
+_HIDDEN = 1e-8  # of a whitened bias: a smaller visible part is rounding
+_TOLERANCE = 3e-4  # of a level: the last Newton step; the error left is of the order of its square
+
+
+class _Scratch(NamedTuple):
+    """Where one estimate is worked out; n rows, h sets of up to m rows, A axes (five, or one)."""
+
+    jacobian: Any  # (n, 6) elsewhere than at the estimate
+    predicted: Any  # (n,)
+    depth: Any  # (K,)
+    position: Any  # (3,)
+    rotation: Any  # (3, 3)
+    turn: Any  # (3, 3)
+    gradients: Any  # (5, 3) of the axes, by the position
+    unit: Any  # (n, n) row by row, a unit bias of it whitened: L⁻¹ e
+    visible: Any  # (n, n) what that leaves in the residual: P L⁻¹ e
+    effect: Any  # (n, A) what it does to an axis: s L⁻¹ e
+    basis: Any  # (6, n) orthonormal, of the Jacobian's columns: Qᵀ
+    root: Any  # (6, 6) R
+    shares: Any  # (A, n) s
+    solved: Any  # (A, 6) R⁻ᵀ a
+    sigma: Any  # (A,)
+    shown: Any  # (m, n) orthonormal, of what a set can show: U of P A = U T
+    triangle: Any  # (m, m) T
+    weights: Any  # (m,) z of Tᵀ z = Aᵀ s: g = |z|
+    directions: Any  # (5, 6) increment of the pose for a unit error of an axis
+    slopes: Any  # (h,)
+    bias: Any  # (h,) the worst root of the non-centrality
+    drift: Any  # (h,) its derivative by the level
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scratch_kernel(n, k, h, m):  # type: ignore[no-untyped-def]
+    return _Scratch(
+        np.empty((n, 6)), np.empty(n), np.empty(k), np.empty(3), np.empty((3, 3)), np.empty((3, 3)),
+        np.empty((5, 3)), np.zeros((n, n)), np.empty((n, n)), np.empty((n, 5)),
+        np.empty((6, n)), np.empty((6, 6)), np.empty((5, n)), np.empty((5, 6)), np.empty(5),
+        np.empty((m, n)), np.empty((m, m)), np.empty(m), np.empty((5, 6)), np.empty(h), np.empty(h), np.empty(h),
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _protect_kernel(frames, intrinsics, hypotheses, monitor, details, out):  # type: ignore[no-untyped-def]
+    """N estimates into `out` (N, 5, 5): level, first-order level, sigma, driver, passed."""
+    rows = hypotheses.rows
+    w = _scratch_kernel(frames.jacobians.shape[1], frames.points.shape[1], rows.shape[0], rows.shape[1])
+    for i in range(frames.jacobians.shape[0]):
+        frame = _frame_kernel(frames, i)
+        _units_kernel(frame.factors, w.unit)
+        _gradients_kernel(frame.positions, frame.points, w.gradients)
+        out[i, :3], out[i, 3], out[i, 4] = math.inf, -1.0, 0.0
+        if not _project_kernel(frame.jacobians, 0, 5, w):
+            continue
+        k = min(i, details.slopes.shape[0] - 1)
+        slopes, separations, thresholds = details.slopes[k], details.separations[k], details.thresholds[k]
+        for s in range(rows.shape[0]):
+            _show_kernel(rows[s], w)
+            for a in range(5):
+                slopes[s, a], separations[s, a] = _slope_kernel(rows[s], a, frame.residuals, w)
+        for a in range(5):
+            out[i, 2, a] = w.sigma[a]
+            out[i, 1, a], driver = _level_kernel(slopes[:, a], w.sigma[a], hypotheses, monitor, w)
+            out[i, 3, a] = driver
+            out[i, 4, a] = _passed_kernel(slopes[:, a], separations[:, a], monitor, thresholds[:, a])
+            _direction_kernel(rows, driver, a, frame.residuals, w)
+        for a in range(5):
+            out[i, 0, a] = _second_level_kernel(
+                frame, intrinsics, hypotheses, monitor, a, out[i, 1, a], out[i, 2, a], slopes[:, a], w
+            )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _frame_kernel(frames, i):  # type: ignore[no-untyped-def]
+    """Estimate `i` of N."""
+    return _Frames(
+        frames.residuals[i],
+        frames.jacobians[i],
+        frames.factors[min(i, frames.factors.shape[0] - 1)],
+        frames.positions[i],
+        frames.rotations[i],
+        frames.points[min(i, frames.points.shape[0] - 1)],
+        frames.edges[min(i, frames.edges.shape[0] - 1)],
+        frames.lines[min(i, frames.lines.shape[0] - 1)],
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _dot_kernel(x, y):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for i in range(x.shape[0]):
+        total += x[i] * y[i]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _subtract_kernel(x, unit):  # type: ignore[no-untyped-def]
+    """Take from x its part along `unit`; how much that was."""
+    along = _dot_kernel(x, unit)
+    for i in range(x.shape[0]):
+        x[i] -= along * unit[i]
+    return along
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _orthogonalise_kernel(vectors, c, triangle):  # type: ignore[no-untyped-def]
+    """Make vector c orthonormal to those before it (Gram-Schmidt, twice); its length before scaling."""
+    x = vectors[c]
+    for b in range(c):
+        triangle[b, c] = _subtract_kernel(x, vectors[b])
+    for b in range(c):
+        triangle[b, c] += _subtract_kernel(x, vectors[b])
+    length = math.sqrt(_dot_kernel(x, x))
+    triangle[c, c] = length
+    for i in range(x.shape[0]):
+        x[i] /= length
+    return length
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gradients_kernel(position, points, out):  # type: ignore[no-untyped-def]
+    """The axes' derivatives (5, 3) by the position; the angles' in degrees a metre.
+
+    Lateral: atan2(y, far end - x). Vertical: atan2(z, horizontal distance to the glide path's origin).
+    """
+    degrees = 180.0 / math.pi
+    x, y, z = position[0], position[1], position[2]
+    out[:] = 0.0
+    out[0, 0] = out[1, 1] = out[2, 2] = 1.0
+    ahead = points[:, 0].max() - x
+    square = ahead * ahead + y * y
+    out[3, 0], out[3, 1] = degrees * y / square, degrees * ahead / square
+    dx = x - GLIDE_PATH_ORIGIN_M
+    level = math.sqrt(dx * dx + y * y)
+    square = level * level + z * z
+    out[4, 0], out[4, 1] = -degrees * z * dx / (level * square), -degrees * z * y / (level * square)
+    out[4, 2] = degrees * level / square
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _units_kernel(factor, unit):  # type: ignore[no-untyped-def]
+    """L⁻¹ e for every row, by forward substitution."""
+    n = factor.shape[0]
+    for r in range(n):
+        for i in range(r, n):
+            total = 1.0 if i == r else 0.0
+            for j in range(r, i):
+                total -= factor[i, j] * unit[r, j]
+            unit[r, i] = total / factor[i, i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project_kernel(jacobian, first, last, w):  # type: ignore[no-untyped-def]
+    """What a bias of each row shows, and does to the axes from `first` to `last`; False without an estimate."""
+    n = jacobian.shape[0]
+    for c in range(6):
+        for i in range(n):
+            w.basis[c, i] = jacobian[i, c]
+        if not _orthogonalise_kernel(w.basis, c, w.root) > 0.0:
+            return False
+    for a in range(first, last):
+        w.shares[a] = 0.0
+        for c in range(6):
+            total = w.gradients[a, c] if c < 3 else 0.0
+            for b in range(c):
+                total -= w.root[b, c] * w.solved[a, b]
+            w.solved[a, c] = total / w.root[c, c]
+            for i in range(n):
+                w.shares[a, i] += w.solved[a, c] * w.basis[c, i]
+        w.sigma[a] = math.sqrt(_dot_kernel(w.shares[a], w.shares[a]))
+    for r in range(n):
+        for i in range(n):
+            w.visible[r, i] = w.unit[r, i]
+        for a in range(first, last):
+            w.effect[r, a] = _dot_kernel(w.unit[r], w.shares[a])
+        for c in range(6):
+            _subtract_kernel(w.visible[r], w.basis[c])
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _show_kernel(rows, w):  # type: ignore[no-untyped-def]
+    """P A = U T of a set: what its biases can show. A direction that cannot gets zeros."""
+    for j in range(rows.shape[0]):
+        if rows[j] < 0:
+            break
+        w.shown[j] = w.visible[rows[j]]
+        unit = w.unit[rows[j]]
+        if not _orthogonalise_kernel(w.shown, j, w.triangle) > _HIDDEN * math.sqrt(_dot_kernel(unit, unit)):
+            w.shown[j] = 0.0
+            w.triangle[j, j] = 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _slope_kernel(rows, a, residual, w):  # type: ignore[no-untyped-def]
+    """g and the separation of the set last shown: Tᵀ z = Aᵀ s, g = |z|, separation z·Uᵀ r.
+
+    A direction that does not show must not move the axis either; else both are infinite.
+    """
+    z, square, separation = w.weights, 0.0, 0.0
+    for j in range(rows.shape[0]):
+        if rows[j] < 0:
+            break
+        total = w.effect[rows[j], a]
+        for b in range(j):
+            total -= w.triangle[b, j] * z[b]
+        z[j] = 0.0
+        if w.triangle[j, j] > 0.0:
+            z[j] = total / w.triangle[j, j]
+        else:
+            unit = w.unit[rows[j]]
+            if abs(total) > _HIDDEN * math.sqrt(_dot_kernel(unit, unit)) * w.sigma[a]:
+                square = separation = math.inf
+        square += z[j] * z[j]
+        separation += z[j] * _dot_kernel(w.shown[j], residual)
+    return math.sqrt(square), separation
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _direction_kernel(rows, driver, a, residual, w):  # type: ignore[no-untyped-def]
+    """How the estimate without the driver errs when it errs by one unit along axis a: C a / aᵀC a.
+
+    Its covariance C is (JᵀJ)⁻¹ + J⁺ A (AᵀPA)⁻¹ Aᵀ J⁺ᵀ; with J = Q R and P A = U T that makes
+    C a = R⁻¹ (R⁻ᵀ a + Qᵀ A T⁻¹ z).
+    """
+    d, scale = w.directions[a], w.sigma[a] ** 2
+    d[:] = w.solved[a]
+    if driver >= 0:
+        _show_kernel(rows[driver], w)
+        slope, _ = _slope_kernel(rows[driver], a, residual, w)
+        scale += slope * slope
+        for j in range(rows.shape[1] - 1, -1, -1):
+            row = rows[driver, j]
+            if row >= 0 and w.triangle[j, j] > 0.0:
+                w.weights[j] /= w.triangle[j, j]
+                for b in range(j):
+                    w.weights[b] -= w.triangle[b, j] * w.weights[j]
+                for c in range(6):
+                    d[c] += w.weights[j] * _dot_kernel(w.basis[c], w.unit[row])
+    for c in range(5, -1, -1):
+        for b in range(c + 1, 6):
+            d[c] -= w.root[c, b] * d[b]
+        d[c] /= w.root[c, c]
+    d /= scale
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _second_level_kernel(frame, intrinsics, hypotheses, monitor, a, level, sigma, slopes, w):  # type: ignore[no-untyped-def]
+    """The level of axis a with slopes from half-way between the estimate and the truth.
+
+    One secant step for the level that is consistent with the slopes half of it away.
+    """
+    if not 0.0 < level < math.inf:
+        return level
+    _move_kernel(frame, 0.5 * level, w.directions[a], w)
+    _gradients_kernel(w.position, frame.points, w.gradients)
+    if not (_linearise_kernel(frame, intrinsics, w) and _project_kernel(w.jacobian, a, a + 1, w)):
+        return math.inf
+    for s in range(slopes.shape[0]):
+        _show_kernel(hypotheses.rows[s], w)
+        slope, _ = _slope_kernel(hypotheses.rows[s], a, frame.residuals, w)
+        # The truth may lie on the other side: to this order the change there is the opposite.
+        w.slopes[s] = slopes[s] + abs(slope - slopes[s]) if slopes[s] < math.inf else math.inf
+    second, _ = _level_kernel(w.slopes, sigma + abs(w.sigma[a] - sigma), hypotheses, monitor, w)
+    return level * level / (2.0 * level - second) if second < 2.0 * level else math.inf
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _move_kernel(frame, size, direction, w):  # type: ignore[no-untyped-def]
+    """The pose moved by `size` along `direction`, or against it: away from the points."""
+    away = 0.0
+    for a in range(3):
+        away += direction[a] * (frame.positions[a] - frame.points[:, a].mean())
+    size = math.copysign(size, away)
+    for a in range(3):
+        w.position[a] = frame.positions[a] + size * direction[a]
+        w.predicted[a] = size * direction[3 + a]
+    cayley_kernel(w.predicted, w.turn)
+    product_kernel(frame.rotations, w.turn, w.rotation)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _linearise_kernel(frame, intrinsics, w):  # type: ignore[no-untyped-def]
+    """The whitened Jacobian at the moved pose; False where a point is not in view."""
+    n, points, lines = w.jacobian.shape[0], 2 * frame.points.shape[0], 2 * frame.edges.shape[0]
+    w.jacobian[:] = frame.jacobians  # what the sensors say is linear in the pose
+    project_kernel(frame.points, w.rotation, w.position, intrinsics, w.predicted, w.jacobian, w.depth)
+    for k in range(frame.points.shape[0]):
+        if not w.depth[k] > 0.0:
+            return False
+    for i in range(lines):
+        w.predicted[points + i] = frame.lines[i // 2, i % 2]  # its sign convention
+    if lines:
+        lines_kernel(frame.edges, w.rotation, w.position, intrinsics, points, w.predicted, w.jacobian)
+    for i in range(min(points + lines, n)):
+        for c in range(6):
+            total = w.jacobian[i, c]
+            for j in range(i):
+                total -= frame.factors[i, j] * w.jacobian[j, c]
+            w.jacobian[i, c] = total / frame.factors[i, i]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _passed_kernel(slopes, separations, monitor, thresholds):  # type: ignore[no-untyped-def]
+    """Solution separation's test of one axis: |separation| ≤ K g; the false alarms in equal parts."""
+    monitored, passed = 0, True
+    for s in range(slopes.shape[0]):
+        monitored += slopes[s] < math.inf
+    factor = _quantile_kernel(monitor.false_alarm_rate / max(monitored, 1))
+    for s in range(slopes.shape[0]):
+        thresholds[s] = factor * slopes[s]
+        passed = passed and abs(separations[s]) <= thresholds[s]
+    return passed
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _level_kernel(slopes, sigma, hypotheses, monitor, w):  # type: ignore[no-untyped-def]
+    """The level of one axis and its driver, once the faults that can hide are charged to the risk."""
+    risk, monitored = monitor.risk - hypotheses.unmonitored, 0
+    driver, most = -2, hypotheses.unmonitored
+    for s in range(slopes.shape[0]):
+        if slopes[s] < math.inf:
+            monitored += 1
+        else:
+            risk -= hypotheses.priors[s]
+            if hypotheses.priors[s] > most:
+                driver, most = s, hypotheses.priors[s]
+    if not risk > 0.0:
+        return math.inf, driver
+    if monitor.separation:
+        return _separation_level_kernel(slopes, sigma, hypotheses, monitor, risk, monitored)
+    return _residual_level_kernel(slopes, sigma, hypotheses, monitor, risk, w)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _separation_level_kernel(slopes, sigma, hypotheses, monitor, risk, monitored):  # type: ignore[no-untyped-def]
+    """Solution separation: the largest of K sigma over the hypotheses; the risk in equal parts."""
+    share = risk / (monitored + 1)
+    tolerated = _quantile_kernel(monitor.false_alarm_rate / max(monitored, 1))
+    level, driver = _quantile_kernel(share / hypotheses.fault_free) * sigma, -1
+    for s in range(slopes.shape[0]):
+        if slopes[s] < math.inf and hypotheses.priors[s] > share:
+            without = math.sqrt(sigma * sigma + slopes[s] * slopes[s])
+            bound = tolerated * slopes[s] + _quantile_kernel(share / hypotheses.priors[s]) * without
+            if bound > level:
+                level, driver = bound, s
+    return level, driver
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _residual_level_kernel(slopes, sigma, hypotheses, monitor, risk, w):  # type: ignore[no-untyped-def]
+    """The level at which the χ² test's missed errors take up the risk.
+
+    In units of sigma, k = g / sigma, F(t) = P(accepted): P(no fault) (1 - rate) 2Q(x)
+    + Σ p max over t of P(|N(k t, 1)| > x) F(t) = risk. Newton on its logarithm, which is nearly
+    straight; the worst t may be held in the derivative (envelope theorem).
+    """
+    low, high, x = 0.0, 0.0, 0.0
+    share, nominal = risk / (slopes.shape[0] + 1), hypotheses.fault_free * (1.0 - monitor.false_alarm_rate)
+    for s in range(-1, slopes.shape[0]):
+        prior, k = (hypotheses.priors[s], slopes[s] / sigma) if s >= 0 else (nominal, 0.0)
+        if k < math.inf and share < prior:
+            # Q(z) ≤ exp(-z²/2) / 2 and F(t) ≤ Q(t - root of the threshold): beyond `high` no term
+            # exceeds its share.
+            reach = math.sqrt(2.0 * math.log(2.0 * prior / share))
+            high = max(high, k * (monitor.root + reach) + reach)
+            x = max(x, k * monitor.root + reach * math.sqrt(1.0 + k * k))
+    w.bias[:] = math.nan
+    w.drift[:] = 0.0
+    driver = -1
+    for _ in range(200):
+        tail, density = _tail_kernel(x)
+        total, fall = 2.0 * nominal * tail, 2.0 * nominal * density
+        driver, most = -1, total
+        for s in range(slopes.shape[0]):
+            if slopes[s] < math.inf:
+                chance, rate = _worst_kernel(x, slopes[s] / sigma, monitor, s, w)
+                chance, rate = hypotheses.priors[s] * chance, hypotheses.priors[s] * rate
+                total, fall = total + chance, fall + rate
+                if chance > most:
+                    driver, most = s, chance
+        if total > risk:
+            low = x
+        else:
+            high = x
+        new = x + math.log(total / risk) * total / fall
+        if not low < new < high:
+            new = 0.5 * (low + high)
+        step = new - x
+        x = new
+        if abs(step) <= _TOLERANCE * x:
+            break
+        for s in range(slopes.shape[0]):
+            w.bias[s] += w.drift[s] * step
+    return x * sigma, driver
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _worst_kernel(x, k, monitor, s, w):  # type: ignore[no-untyped-def]
+    """max over t of P(|N(k t, 1)| > x) F(t), and minus its derivative by x; t and dt/dx into row s.
+
+    Both factors are log-concave in t² (Finner & Roters 1997), so that there is one maximum.
+    """
+    low, high = 0.0, _STEP * (monitor.acceptance.shape[0] - 1)
+    if x - k * high > _REACH:  # no number, whatever t
+        return 0.0, 0.0
+    tail, density = _tail_kernel(x)
+    log_accepted, _, bow = _accept_kernel(0.0, monitor.acceptance)
+    if k * k * x * (density / tail if x < 30.0 else x) + bow <= 0.0:  # the best is not to show at all
+        w.bias[s] = math.nan
+        accepted = 2.0 * math.exp(log_accepted)
+        return tail * accepted, density * accepted
+    t = w.bias[s]
+    if not 0.0 < t < high:
+        t = min((monitor.root + k * x) / (1.0 + k * k), 0.5 * high)
+    for _ in range(100):
+        chance, density, rise, bend = _exceed_kernel(x, k * t)
+        log_accepted, fall, bow = _accept_kernel(t, monitor.acceptance)
+        gradient, curvature = k * rise + fall, k * k * bend + bow
+        step = -gradient / curvature
+        if curvature < 0.0 and step * gradient < 1e-8:
+            break
+        if gradient > 0.0:
+            low = t
+        else:
+            high = t
+        t = t + step if curvature < 0.0 and low < t + step < high else 0.5 * (low + high)
+    w.bias[s], w.drift[s] = t + step, k * bend / curvature
+    accepted = math.exp(log_accepted + 0.5 * step * gradient)  # with what the last step still brings
+    return chance * accepted, density * accepted
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _accept_kernel(t, acceptance):  # type: ignore[no-untyped-def]
+    """log F, its first and its second derivative."""
+    cell = min(int(t / _STEP), acceptance.shape[0] - 1)
+    u = t / _STEP - cell
+    c0, c1, c2, c3 = acceptance[cell, 0], acceptance[cell, 1], acceptance[cell, 2], acceptance[cell, 3]
+    value = c0 + u * (c1 + u * (c2 + u * c3))
+    return value, (c1 + u * (2.0 * c2 + 3.0 * u * c3)) / _STEP, (2.0 * c2 + 6.0 * u * c3) / (_STEP * _STEP)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _exceed_kernel(x, u):  # type: ignore[no-untyped-def]
+    """P(|N(u, 1)| > x), minus its derivative by x, and two derivatives of its logarithm by u."""
+    z = x - u
+    total, density = _tail_kernel(z)
+    if z > 30.0:  # density / total as a series: soon neither is a number
+        rise = z + 1.0 / z - 2.0 / z**3
+        return total, density, rise, rise * (z - rise)
+    rise, bend = density, z * density
+    if x * u < 20.0:  # else the other tail is less than e^-40 of this one
+        tail, other = _tail_kernel(x + u)
+        total, density, rise, bend = total + tail, density + other, rise - other, bend + (x + u) * other
+    rise, bend = rise / total, bend / total
+    return total, density, rise, bend - rise * rise
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tail_kernel(z):  # type: ignore[no-untyped-def]
+    """P(N(0, 1) > z) and the density there."""
+    return 0.5 * math.erfc(z * math.sqrt(0.5)), math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _quantile_kernel(probability):  # type: ignore[no-untyped-def]
+    """k ≥ 0 with P(|N(0, 1)| > k) = probability; 0 from a probability of 1 on. Newton on the logarithm."""
+    if not probability < 1.0:
+        return 0.0
+    k = math.sqrt(-2.0 * math.log(probability))  # above, as 2Q(k) ≤ exp(-k²/2)
+    for _ in range(50):
+        tail, density = _tail_kernel(k)
+        step = math.log(2.0 * tail / probability) * tail / density
+        k += step
+        if abs(step) <= 1e-14 * k:
+            break
+    return k
