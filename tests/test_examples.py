@@ -8,3 +8,12 @@ def test_solve_and_doubt(capsys):
     runpy.run_path(str(EXAMPLES / "solve_and_doubt.py"))
     out = capsys.readouterr().out
     assert out.index(" USE: ") < out.index("DO_NOT_USE: ")
+
+
+def test_window(capsys):
+    runpy.run_path(str(EXAMPLES / "window.py"))
+    out = capsys.readouterr().out
+    assert "DO_NOT_USE" in out
+    assert "explained by: runway " in out
+    assert " m shorter" in out
+    assert "by themselves so far: 0" in out
