@@ -39,5 +39,5 @@ clean:
 
 .venv/dev: .venv/base
 	@echo "installing the training and development tools into .venv (once) ..."
-	$(PIP) -e ".[train]" --group dev
+	$(PIP) -e ".[train,cluster]" --group dev
 	@touch $@

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -12,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -217,6 +219,36 @@ def export(
     console.print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB, {info.backbone}, {info.covariance} covariance)")
 
 
+@app.command()
+def campaign(
+    config: Annotated[Path, typer.Argument(help="What varies (TOML); see examples/campaign.toml.")],
+    out: Out = Path("results/campaign"),
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per processor by default.")] = None,
+    ray: Annotated[str | None, typer.Option(help="Run on Ray: the cluster's address, or local.")] = None,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    """How often does the monitor err? Monte Carlo over poses, errors and faults; run again to go on after a stop."""
+    from shortfinal.campaign.config import read_campaign
+    from shortfinal.campaign.report import render_table, write_figures, write_tables
+    from shortfinal.campaign.run import run_campaign
+
+    plan = read_campaign(config)
+    with _trials_bar(quiet=as_json) as seen:
+        counts, effort = run_campaign(plan, out, workers=workers, ray=ray, seen=seen)
+    tables, figures = write_tables(plan, counts, out), write_figures(plan, counts, out)
+    if as_json:
+        _print_json({"scenarios": tables, **asdict(effort), "out": str(out)})
+        return
+    console.print(render_table(tables))
+    console.print(
+        "In brackets: 95 % intervals (Clopper-Pearson). Where there is a fault, every trial has it. RMS error of "
+        "accepted trials, and median protection level: along / cross / vertical."
+    )
+    memory = "" if effort.peak_mb is None else f", at most {effort.peak_mb:.0f} MB a process"
+    console.print(f"{effort.trials:,} trials in {effort.seconds:.1f} s{memory}")
+    console.print(f"written: {out}/tables.json, table.csv, {len(figures)} figures")
+
+
 @data_app.command("render")
 def data_render(
     count: Annotated[int, typer.Option(help="How many pictures.", min=1)],
@@ -300,6 +332,30 @@ def _bar() -> Progress:
     return Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
     )
+
+
+@contextmanager
+def _trials_bar(*, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A bar with rate and time left, moved by a function of (trials done, of so many)."""
+    if quiet:
+        yield lambda done, total: None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[rate]}"),
+               TimeRemainingColumn())  # fmt: skip
+    start, before = time.perf_counter(), None
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("compiling", total=None, rate="")
+
+        def seen(done: int, total: int) -> None:
+            nonlocal start, before
+            if before is None:  # what an earlier run did says nothing of this one's speed
+                start, before = time.perf_counter(), done
+                bar.reset(task, total=total, completed=done, description="trials")
+                return
+            rate = (done - before) / (time.perf_counter() - start)
+            bar.update(task, completed=done, rate=f"{rate:,.0f} a second")
+
+        yield seen
 
 
 def _track(items: Iterable[T], total: int, quiet: bool) -> Iterator[T]:

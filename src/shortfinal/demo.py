@@ -188,14 +188,14 @@ def _record(frame: Flown) -> dict[str, object]:
 
 
 def _draw_timeline(flown: list[Flown], path: Path) -> None:
-    """Position errors within their 2 sigma, and the test's p-value, over the distance to go."""
+    """Position errors within their 2 sigma and protection levels, and the test's p-value, over the distance to go."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 8), dpi=110, layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     distance = np.array([-f.truth.position_m[0] for f in flown])
     error = np.array([f.error_m if f.error_m is not None else np.full(3, np.nan) for f in flown])
-    sigma = np.array([_sigma(f) for f in flown])
+    sigma, level = np.array([_sigma(f) for f in flown]), np.array([_level(f) for f in flown])
     for axis, (name, ax) in enumerate(zip(("along-track", "cross-track", "vertical"), axes[:3], strict=True)):
         ax.fill_between(
             distance, -2 * sigma[:, axis], 2 * sigma[:, axis], color="#4c9be8", alpha=0.3, lw=0, label="± 2σ"
@@ -207,10 +207,12 @@ def _draw_timeline(flown: list[Flown], path: Path) -> None:
         ):
             mine = np.array([f.result.verdict.decision is decision for f in flown])
             ax.plot(distance[mine], error[mine, axis], ".", color=colour, label=decision.value)
+        for side in (-1, 1):
+            ax.plot(distance, side * level[:, axis], "k--", lw=0.8, label="protection level" if side > 0 else None)
         ax.set_ylabel(f"{name} error (m)")
         ax.set_yscale("symlog", linthresh=(100, 10, 10)[axis])
         ax.axhline(0, color="k", lw=0.5)
-    axes[0].legend(ncol=4, fontsize=8, loc="lower left")
+    axes[0].legend(ncol=5, fontsize=8, loc="lower left")
     p = np.array([f.result.verdict.p_value if f.result.verdict.p_value is not None else np.nan for f in flown])
     axes[3].semilogy(distance, np.maximum(p, 1e-16), "k.-", lw=0.7)
     axes[3].axhline(1e-3, color="#d93025", ls="--", lw=1, label="false-alarm rate 10⁻³")
@@ -233,3 +235,9 @@ def _sigma(frame: Flown) -> Array:
     estimate = frame.result.estimate
     sigma = None if estimate is None else estimate.sigma_position_m
     return np.full(3, np.nan) if sigma is None else sigma
+
+
+def _level(frame: Flown) -> Array:
+    """Along, cross and vertical protection levels (3,), m; NaN where there is none to draw."""
+    levels = np.full(3, np.inf) if frame.result.protection is None else np.array(frame.result.protection.levels[:3])
+    return np.where(np.isfinite(levels), levels, np.nan)

@@ -27,13 +27,12 @@ from itertools import combinations
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.special import chdtri, gammainc, gammaln
 
 from shortfinal.errors import InputError
 from shortfinal.features import Feature
-from shortfinal.geometry import cayley_kernel, lines_kernel, product_kernel, project_kernel
+from shortfinal.geometry import cayley_kernel, copy_kernel, kernel, lines_kernel, product_kernel, project_kernel
 from shortfinal.integrity import FALSE_ALARM_RATE, check_rate
 from shortfinal.pose import CHUNK, PoseEstimate, PoseEstimateBatch, SolverStatus
 
@@ -196,6 +195,7 @@ def protection_levels(
         raise InputError(f"est: no pose to protect: the solver ended {est.status.value}")
     plan = _plan(_feature_key(est.features), _prior_key(fault_prior), max_faults)
     details, out = _Details(*np.empty((3, 1, len(plan.names), 5))), np.empty((1, 5, 5))
+    layout = _layout(len(est.residual), len(est.points), *plan.hypotheses.rows.shape)
     frames = _Frames(
         # Copies: read-only arrays are another type to the compiler, and would be compiled for anew.
         est.residual[None].copy(),
@@ -207,7 +207,7 @@ def protection_levels(
         _NO_EDGES if est.edges is None else est.edges[None].copy(),
         _NO_LINES if est.lines is None else est.lines.mean[None].copy(),
     )
-    _protect_kernel(frames, est.camera.intrinsics.copy(), plan.hypotheses, monitor, details, out)
+    _protect_kernel(frames, est.camera.intrinsics.copy(), plan.hypotheses, monitor, layout, np.empty(layout[-1]), details, out)
     levels, first_order, sigma, drivers, passed = out[0].tolist()
     separation = method == METHODS[1]
     return ProtectionLevels(
@@ -246,6 +246,7 @@ def protection_levels_batch(
     """
     monitor = _monitor(batch.dof, integrity_risk, false_alarm_rate, method)
     plan = _plan(_feature_key(batch.features), _prior_key(fault_prior), max_faults)
+    layout = _layout(batch.residuals.shape[1], batch.mean_px.shape[1], *plan.hypotheses.rows.shape)
     count, intrinsics, out = len(batch), batch.camera.intrinsics.copy(), np.empty((len(batch), 5, 5))
     frames = _Frames(
         batch.residuals, batch.jacobians, batch.factors.copy(), batch.positions, batch.rotations,
@@ -259,6 +260,8 @@ def protection_levels_batch(
             intrinsics,
             plan.hypotheses,
             monitor,
+            layout,
+            np.empty(layout[-1]),
             _Details(*np.empty((3, 1, len(plan.names), 5))),  # shared by all: scratch
             out[part],
         )
@@ -408,80 +411,125 @@ def _log_sum(logs: Array) -> Array:
     return np.asarray(top[..., 0] + np.log(np.exp(logs - top).sum(axis=-1)))
 
 
-# The kernels below are compiled. Memory is allocated once a call.
+# The kernels below are compiled; they work in memory that the caller owns.
 
 _HIDDEN = 1e-8  # of a whitened bias: a smaller visible part is rounding
-_TOLERANCE = 3e-4  # of a level: the last Newton step; the error left is of the order of its square
+_TOLERANCE = 1e-3  # of a level: the last step; the error left is a tenth of its square
 
 
-class _Scratch(NamedTuple):
-    """Where one estimate is worked out; n rows, h sets of up to m rows, A axes (five, or one)."""
+class _Linear(NamedTuple):
+    """The problem linearised somewhere, whitened; n rows. J = Q R by Householder's reflections."""
 
-    jacobian: Any  # (n, 6) elsewhere than at the estimate
-    predicted: Any  # (n,)
+    mirrors: Any  # (6, n) what each reflects by: 1 - v vᵀ / pivot
+    pivots: Any  # (6,)
+    root: Any  # (6, 6) R
+    null: Any  # (n - 6, n) orthonormal, of what no pose explains: P = Nᵀ N
+    visible: Any  # (n, n - 6) row by row, what a unit bias of it shows: N L⁻¹ e
+    effect: Any  # (n, 5) what it does to the axes: s L⁻¹ e
+    share: Any  # (n,) s
+    solved: Any  # (5, 6) R⁻ᵀ a
+    sigma: Any  # (5,)
+
+
+class _Shown(NamedTuple):
+    """What a set of faulty features can show; up to m rows."""
+
+    basis: Any  # (m, n - 6) orthonormal: N A = U T, here Uᵀ
+    triangle: Any  # (m, m) T
+    weights: Any  # (m,) z of Tᵀ z = Aᵀ s: g = |z|
+
+
+class _Elsewhere(NamedTuple):
+    """The measurements linearised at another pose."""
+
+    jacobian: Any  # (n, 6)
+    predicted: Any  # (n,) of points and lines
     depth: Any  # (K,)
     position: Any  # (3,)
     rotation: Any  # (3, 3)
     turn: Any  # (3, 3)
-    gradients: Any  # (5, 3) of the axes, by the position
-    unit: Any  # (n, n) row by row, a unit bias of it whitened: L⁻¹ e
-    visible: Any  # (n, n) what that leaves in the residual: P L⁻¹ e
-    effect: Any  # (n, A) what it does to an axis: s L⁻¹ e
-    basis: Any  # (6, n) orthonormal, of the Jacobian's columns: Qᵀ
-    root: Any  # (6, 6) R
-    shares: Any  # (A, n) s
-    solved: Any  # (A, 6) R⁻ᵀ a
-    sigma: Any  # (A,)
-    shown: Any  # (m, n) orthonormal, of what a set can show: U of P A = U T
-    triangle: Any  # (m, m) T
-    weights: Any  # (m,) z of Tᵀ z = Aᵀ s: g = |z|
-    directions: Any  # (5, 6) increment of the pose for a unit error of an axis
-    slopes: Any  # (h,)
-    bias: Any  # (h,) the worst root of the non-centrality
+    increment: Any  # (6,)
+
+
+class _Worst(NamedTuple):
+    """The worst faults, kept from one Newton step to the next."""
+
+    bias: Any  # (h,) root of the non-centrality
     drift: Any  # (h,) its derivative by the level
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _scratch_kernel(n, k, h, m):  # type: ignore[no-untyped-def]
+class _Scratch(NamedTuple):
+    """Where one estimate is worked out."""
+
+    unit: Any  # (n, n) row by row, a unit bias of it whitened: L⁻¹ e; set from the diagonal on
+    size: Any  # (n,) |L⁻¹ e|
+    left: Any  # (n - 6,) the residual: N r
+    gradients: Any  # (5, 3) of the axes, by the position
+    directions: Any  # (5, 6) increment of the pose for a unit error of an axis
+    weights: Any  # (5, h) derivative of an axis' level by the slopes
+    linear: Any
+    shown: Any
+    elsewhere: Any
+    worst: Any
+
+
+@lru_cache(maxsize=64)
+def _layout(n: int, k: int, h: int, m: int) -> NDArray[np.int64]:
+    """Where the arrays of the scratch begin and end in one piece of memory: n rows, K points, h sets of up to m rows."""
+    sizes = (
+        n * n, n, n - 6, 5 * 3, 5 * 6,
+        6 * n, 6, 6 * 6, (n - 6) * n, n * (n - 6), 5 * n, n, 5 * 6, 5,
+        m * (n - 6), m * m, m,
+        6 * n, n, k, 3, 3 * 3, 3 * 3, 6,
+        5 * h, h, h,
+    )  # fmt: skip
+    return np.cumsum((0, *sizes))
+
+
+@kernel
+def _scratch_kernel(work, e, n, h, m):  # type: ignore[no-untyped-def]
+    """The scratch, cut from `work` at the ends `e`."""
     return _Scratch(
-        np.empty((n, 6)), np.empty(n), np.empty(k), np.empty(3), np.empty((3, 3)), np.empty((3, 3)),
-        np.empty((5, 3)), np.zeros((n, n)), np.empty((n, n)), np.empty((n, 5)),
-        np.empty((6, n)), np.empty((6, 6)), np.empty((5, n)), np.empty((5, 6)), np.empty(5),
-        np.empty((m, n)), np.empty((m, m)), np.empty(m), np.empty((5, 6)), np.empty(h), np.empty(h), np.empty(h),
+        work[e[0] : e[1]].reshape(n, n), work[e[1] : e[2]], work[e[2] : e[3]], work[e[3] : e[4]].reshape(5, 3),
+        work[e[4] : e[5]].reshape(5, 6),
+        work[e[24] : e[25]].reshape(5, h),
+        _Linear(
+            work[e[5] : e[6]].reshape(6, n), work[e[6] : e[7]], work[e[7] : e[8]].reshape(6, 6),
+            work[e[8] : e[9]].reshape(n - 6, n), work[e[9] : e[10]].reshape(n, n - 6),
+            work[e[10] : e[11]].reshape(n, 5), work[e[11] : e[12]], work[e[12] : e[13]].reshape(5, 6),
+            work[e[13] : e[14]],
+        ),
+        _Shown(work[e[14] : e[15]].reshape(m, n - 6), work[e[15] : e[16]].reshape(m, m), work[e[16] : e[17]]),
+        _Elsewhere(
+            work[e[17] : e[18]].reshape(n, 6), work[e[18] : e[19]], work[e[19] : e[20]], work[e[20] : e[21]],
+            work[e[21] : e[22]].reshape(3, 3), work[e[22] : e[23]].reshape(3, 3), work[e[23] : e[24]],
+        ),
+        _Worst(work[e[25] : e[26]], work[e[26] : e[27]]),
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _protect_kernel(frames, intrinsics, hypotheses, monitor, details, out):  # type: ignore[no-untyped-def]
+@kernel
+def _protect_kernel(frames, intrinsics, hypotheses, monitor, layout, work, details, out):  # type: ignore[no-untyped-def]
     """N estimates into `out` (N, 5, 5): level, first-order level, sigma, driver, passed."""
-    rows = hypotheses.rows
-    w = _scratch_kernel(frames.jacobians.shape[1], frames.points.shape[1], rows.shape[0], rows.shape[1])
+    w = _scratch_kernel(work, layout, frames.jacobians.shape[1], *hypotheses.rows.shape)
     for i in range(frames.jacobians.shape[0]):
+        for a in range(5):
+            out[i, 0, a] = out[i, 1, a] = out[i, 2, a] = math.inf
+            out[i, 3, a], out[i, 4, a] = -1.0, 0.0
         frame = _frame_kernel(frames, i)
-        _units_kernel(frame.factors, w.unit)
+        _units_kernel(frame.factors, w.unit, w.size)
         _gradients_kernel(frame.positions, frame.points, w.gradients)
-        out[i, :3], out[i, 3], out[i, 4] = math.inf, -1.0, 0.0
-        if not _project_kernel(frame.jacobians, 0, 5, w):
-            continue
-        k = min(i, details.slopes.shape[0] - 1)
-        slopes, separations, thresholds = details.slopes[k], details.separations[k], details.thresholds[k]
-        for s in range(rows.shape[0]):
-            _show_kernel(rows[s], w)
+        if _project_kernel(frame.jacobians, w.gradients, w.unit, 0, 5, w.linear):
+            j = min(i, details.slopes.shape[0] - 1)
+            slopes, separations, thresholds = details.slopes[j], details.separations[j], details.thresholds[j]
+            _first_levels_kernel(frame.residuals, hypotheses, monitor, w, slopes, separations, thresholds, out[i])
             for a in range(5):
-                slopes[s, a], separations[s, a] = _slope_kernel(rows[s], a, frame.residuals, w)
-        for a in range(5):
-            out[i, 2, a] = w.sigma[a]
-            out[i, 1, a], driver = _level_kernel(slopes[:, a], w.sigma[a], hypotheses, monitor, w)
-            out[i, 3, a] = driver
-            out[i, 4, a] = _passed_kernel(slopes[:, a], separations[:, a], monitor, thresholds[:, a])
-            _direction_kernel(rows, driver, a, frame.residuals, w)
-        for a in range(5):
-            out[i, 0, a] = _second_level_kernel(
-                frame, intrinsics, hypotheses, monitor, a, out[i, 1, a], out[i, 2, a], slopes[:, a], w
-            )
+                out[i, 0, a] = _second_level_kernel(
+                    frame, intrinsics, hypotheses.rows, w, a, slopes[:, a], out[i, 1, a], out[i, 2, a]
+                )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _frame_kernel(frames, i):  # type: ignore[no-untyped-def]
     """Estimate `i` of N."""
     return _Frames(
@@ -496,7 +544,32 @@ def _frame_kernel(frames, i):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
+def _first_levels_kernel(residual, hypotheses, monitor, w, slopes, separations, thresholds, out):  # type: ignore[no-untyped-def]
+    """Slopes and levels of all axes, linearised at the estimate, and where each axis' error would lead."""
+    rows = hypotheses.rows
+    for d in range(w.left.shape[0]):
+        w.left[d] = _dot_kernel(w.linear.null[d], residual)
+    for s in range(rows.shape[0]):
+        _show_kernel(rows[s], w.size, w.linear.visible, w.shown)
+        for a in range(5):
+            slopes[s, a] = _slope_kernel(rows[s], a, w.size, w.linear, w.shown)
+            separations[s, a] = _separation_kernel(w.left, slopes[s, a], w.shown)
+    for a in range(5):
+        sigma = w.linear.sigma[a]
+        level, driver = _level_kernel(slopes[:, a], sigma, hypotheses, monitor, w.worst, w.weights[a])
+        passed = not monitor.separation or _passed_kernel(slopes[:, a], separations[:, a], monitor, thresholds[:, a])
+        out[1, a], out[2, a], out[3, a], out[4, a] = level, sigma, driver, passed
+        copy_kernel(w.linear.solved[a], w.directions[a])
+        scale = sigma * sigma
+        if driver >= 0:
+            _show_kernel(rows[driver], w.size, w.linear.visible, w.shown)
+            scale += _slope_kernel(rows[driver], a, w.size, w.linear, w.shown) ** 2
+            _add_bias_kernel(rows[driver], w.unit, w.linear, w.shown, w.directions[a])
+        _back_kernel(w.linear.root, scale, w.directions[a])
+
+
+@kernel
 def _dot_kernel(x, y):  # type: ignore[no-untyped-def]
     total = 0.0
     for i in range(x.shape[0]):
@@ -504,7 +577,7 @@ def _dot_kernel(x, y):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _subtract_kernel(x, unit):  # type: ignore[no-untyped-def]
     """Take from x its part along `unit`; how much that was."""
     along = _dot_kernel(x, unit)
@@ -513,7 +586,7 @@ def _subtract_kernel(x, unit):  # type: ignore[no-untyped-def]
     return along
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _orthogonalise_kernel(vectors, c, triangle):  # type: ignore[no-untyped-def]
     """Make vector c orthonormal to those before it (Gram-Schmidt, twice); its length before scaling."""
     x = vectors[c]
@@ -528,7 +601,7 @@ def _orthogonalise_kernel(vectors, c, triangle):  # type: ignore[no-untyped-def]
     return length
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _gradients_kernel(position, points, out):  # type: ignore[no-untyped-def]
     """The axes' derivatives (5, 3) by the position; the angles' in degrees a metre.
 
@@ -536,9 +609,13 @@ def _gradients_kernel(position, points, out):  # type: ignore[no-untyped-def]
     """
     degrees = 180.0 / math.pi
     x, y, z = position[0], position[1], position[2]
-    out[:] = 0.0
-    out[0, 0] = out[1, 1] = out[2, 2] = 1.0
-    ahead = points[:, 0].max() - x
+    end = points[0, 0]
+    for k in range(1, points.shape[0]):
+        end = max(end, points[k, 0])
+    for a in range(5):
+        for b in range(3):
+            out[a, b] = 1.0 if a == b else 0.0
+    ahead = end - x
     square = ahead * ahead + y * y
     out[3, 0], out[3, 1] = degrees * y / square, degrees * ahead / square
     dx = x - GLIDE_PATH_ORIGIN_M
@@ -548,9 +625,9 @@ def _gradients_kernel(position, points, out):  # type: ignore[no-untyped-def]
     out[4, 2] = degrees * level / square
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _units_kernel(factor, unit):  # type: ignore[no-untyped-def]
-    """L⁻¹ e for every row, by forward substitution."""
+@kernel
+def _units_kernel(factor, unit, size):  # type: ignore[no-untyped-def]
+    """L⁻¹ e of every row r from its entry r on, by forward substitution, and its length."""
     n = factor.shape[0]
     for r in range(n):
         for i in range(r, n):
@@ -558,161 +635,221 @@ def _units_kernel(factor, unit):  # type: ignore[no-untyped-def]
             for j in range(r, i):
                 total -= factor[i, j] * unit[r, j]
             unit[r, i] = total / factor[i, i]
+        size[r] = math.sqrt(_dot_kernel(unit[r, r:], unit[r, r:]))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _project_kernel(jacobian, first, last, w):  # type: ignore[no-untyped-def]
-    """What a bias of each row shows, and does to the axes from `first` to `last`; False without an estimate."""
-    n = jacobian.shape[0]
+@kernel
+def _mirror_kernel(linear, c, x):  # type: ignore[no-untyped-def]
+    """Reflect x by mirror c, which is zero before row c."""
+    v, total = linear.mirrors[c], 0.0
+    for i in range(c, x.shape[0]):
+        total += v[i] * x[i]
+    total /= linear.pivots[c]
+    for i in range(c, x.shape[0]):
+        x[i] -= total * v[i]
+
+
+@kernel
+def _decompose_kernel(jacobian, linear):  # type: ignore[no-untyped-def]
+    """J = Q R, and the basis of what is orthogonal to J; False for NaN, or columns that depend on one another."""
+    mirrors, n = linear.mirrors, jacobian.shape[0]
     for c in range(6):
+        v, square = mirrors[c], 0.0
         for i in range(n):
-            w.basis[c, i] = jacobian[i, c]
-        if not _orthogonalise_kernel(w.basis, c, w.root) > 0.0:
+            v[i] = jacobian[i, c]
+        for b in range(c):
+            _mirror_kernel(linear, b, v)
+            linear.root[b, c] = v[b]
+            v[b] = 0.0
+        for i in range(c, n):
+            square += v[i] * v[i]
+        if not square > 0.0:
             return False
-    for a in range(first, last):
-        w.shares[a] = 0.0
-        for c in range(6):
-            total = w.gradients[a, c] if c < 3 else 0.0
-            for b in range(c):
-                total -= w.root[b, c] * w.solved[a, b]
-            w.solved[a, c] = total / w.root[c, c]
-            for i in range(n):
-                w.shares[a, i] += w.solved[a, c] * w.basis[c, i]
-        w.sigma[a] = math.sqrt(_dot_kernel(w.shares[a], w.shares[a]))
-    for r in range(n):
+        diagonal = -math.copysign(math.sqrt(square), v[c])
+        v[c] -= diagonal
+        linear.root[c, c], linear.pivots[c] = diagonal, -diagonal * v[c]
+    for d in range(n - 6):
+        x = linear.null[d]
         for i in range(n):
-            w.visible[r, i] = w.unit[r, i]
-        for a in range(first, last):
-            w.effect[r, a] = _dot_kernel(w.unit[r], w.shares[a])
-        for c in range(6):
-            _subtract_kernel(w.visible[r], w.basis[c])
+            x[i] = 1.0 if i == 6 + d else 0.0
+        for c in range(5, -1, -1):
+            _mirror_kernel(linear, c, x)
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _show_kernel(rows, w):  # type: ignore[no-untyped-def]
-    """P A = U T of a set: what its biases can show. A direction that cannot gets zeros."""
+@kernel
+def _project_kernel(jacobian, gradients, unit, first, last, linear):  # type: ignore[no-untyped-def]
+    """What a bias of each row shows, and does to the axes from `first` to `last`; False without an estimate."""
+    if not _decompose_kernel(jacobian, linear):
+        return False
+    share, n = linear.share, jacobian.shape[0]
+    for a in range(first, last):
+        solved, square = linear.solved[a], 0.0
+        for i in range(n):
+            share[i] = 0.0
+        for c in range(6):
+            total = gradients[a, c] if c < 3 else 0.0
+            for b in range(c):
+                total -= linear.root[b, c] * solved[b]
+            solved[c] = share[c] = total / linear.root[c, c]
+            square += solved[c] * solved[c]
+        linear.sigma[a] = math.sqrt(square)
+        for c in range(5, -1, -1):
+            _mirror_kernel(linear, c, share)
+        for r in range(n):
+            linear.effect[r, a] = _dot_kernel(unit[r, r:], share[r:])
+    for r in range(n):
+        for d in range(n - 6):
+            linear.visible[r, d] = _dot_kernel(unit[r, r:], linear.null[d, r:])
+    return True
+
+
+@kernel
+def _show_kernel(rows, size, visible, shown):  # type: ignore[no-untyped-def]
+    """N A = U T of a set: what its biases can show. A direction that cannot gets zeros."""
     for j in range(rows.shape[0]):
-        if rows[j] < 0:
-            break
-        w.shown[j] = w.visible[rows[j]]
-        unit = w.unit[rows[j]]
-        if not _orthogonalise_kernel(w.shown, j, w.triangle) > _HIDDEN * math.sqrt(_dot_kernel(unit, unit)):
-            w.shown[j] = 0.0
-            w.triangle[j, j] = 0.0
+        row = rows[j]
+        if row >= 0:
+            copy_kernel(visible[row], shown.basis[j])
+            if not _orthogonalise_kernel(shown.basis, j, shown.triangle) > _HIDDEN * size[row]:
+                shown.triangle[j, j] = 0.0
+                for i in range(visible.shape[1]):
+                    shown.basis[j, i] = 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _slope_kernel(rows, a, residual, w):  # type: ignore[no-untyped-def]
-    """g and the separation of the set last shown: Tᵀ z = Aᵀ s, g = |z|, separation z·Uᵀ r.
-
-    A direction that does not show must not move the axis either; else both are infinite.
-    """
-    z, square, separation = w.weights, 0.0, 0.0
+@kernel
+def _slope_kernel(rows, a, size, linear, shown):  # type: ignore[no-untyped-def]
+    """g of the set shown last: Tᵀ z = Aᵀ s, g = |z|. Infinite where what does not show moves the axis."""
+    z, square = shown.weights, 0.0
     for j in range(rows.shape[0]):
-        if rows[j] < 0:
-            break
-        total = w.effect[rows[j], a]
-        for b in range(j):
-            total -= w.triangle[b, j] * z[b]
-        z[j] = 0.0
-        if w.triangle[j, j] > 0.0:
-            z[j] = total / w.triangle[j, j]
-        else:
-            unit = w.unit[rows[j]]
-            if abs(total) > _HIDDEN * math.sqrt(_dot_kernel(unit, unit)) * w.sigma[a]:
-                square = separation = math.inf
-        square += z[j] * z[j]
-        separation += z[j] * _dot_kernel(w.shown[j], residual)
-    return math.sqrt(square), separation
+        row, z[j] = rows[j], 0.0
+        if row >= 0:
+            total = linear.effect[row, a]
+            for b in range(j):
+                total -= shown.triangle[b, j] * z[b]
+            if shown.triangle[j, j] > 0.0:
+                z[j] = total / shown.triangle[j, j]
+            elif abs(total) > _HIDDEN * size[row] * linear.sigma[a]:
+                square = math.inf
+            square += z[j] * z[j]
+    return math.sqrt(square)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _direction_kernel(rows, driver, a, residual, w):  # type: ignore[no-untyped-def]
-    """How the estimate without the driver errs when it errs by one unit along axis a: C a / aᵀC a.
+@kernel
+def _separation_kernel(left, slope, shown):  # type: ignore[no-untyped-def]
+    """The estimate less that without the set, along the axis: z·Uᵀ N r; infinite as the slope is."""
+    separation = 0.0 if slope < math.inf else math.inf
+    for j in range(shown.weights.shape[0]):
+        if shown.weights[j] != 0.0:
+            separation += shown.weights[j] * _dot_kernel(shown.basis[j], left)
+    return separation
 
-    Its covariance C is (JᵀJ)⁻¹ + J⁺ A (AᵀPA)⁻¹ Aᵀ J⁺ᵀ; with J = Q R and P A = U T that makes
-    C a = R⁻¹ (R⁻ᵀ a + Qᵀ A T⁻¹ z).
-    """
-    d, scale = w.directions[a], w.sigma[a] ** 2
-    d[:] = w.solved[a]
-    if driver >= 0:
-        _show_kernel(rows[driver], w)
-        slope, _ = _slope_kernel(rows[driver], a, residual, w)
-        scale += slope * slope
-        for j in range(rows.shape[1] - 1, -1, -1):
-            row = rows[driver, j]
-            if row >= 0 and w.triangle[j, j] > 0.0:
-                w.weights[j] /= w.triangle[j, j]
-                for b in range(j):
-                    w.weights[b] -= w.triangle[b, j] * w.weights[j]
-                for c in range(6):
-                    d[c] += w.weights[j] * _dot_kernel(w.basis[c], w.unit[row])
+
+# How the estimate without the driver errs when it errs by one unit along an axis: C a / aᵀC a, with
+# C = (JᵀJ)⁻¹ + J⁺ A (AᵀPA)⁻¹ Aᵀ J⁺ᵀ, so that C a = R⁻¹ (R⁻ᵀ a + Qᵀ A T⁻¹ z) and aᵀC a = σ² + g².
+
+
+@kernel
+def _add_bias_kernel(rows, unit, linear, shown, out):  # type: ignore[no-untyped-def]
+    """Add Qᵀ A T⁻¹ z."""
+    triangle, z, bias = shown.triangle, shown.weights, linear.share
+    bias[:] = 0.0
+    for j in range(rows.shape[0] - 1, -1, -1):
+        if rows[j] >= 0 and triangle[j, j] > 0.0:
+            z[j] /= triangle[j, j]
+            for b in range(j):
+                z[b] -= triangle[b, j] * z[j]
+            for i in range(rows[j], bias.shape[0]):
+                bias[i] += z[j] * unit[rows[j], i]
+    for c in range(6):
+        _mirror_kernel(linear, c, bias)
+        out[c] += bias[c]
+
+
+@kernel
+def _back_kernel(root, scale, out):  # type: ignore[no-untyped-def]
+    """R⁻¹ of `out`, over `scale`."""
     for c in range(5, -1, -1):
         for b in range(c + 1, 6):
-            d[c] -= w.root[c, b] * d[b]
-        d[c] /= w.root[c, c]
-    d /= scale
+            out[c] -= root[c, b] * out[b]
+        out[c] /= root[c, c]
+    for c in range(6):
+        out[c] /= scale
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _second_level_kernel(frame, intrinsics, hypotheses, monitor, a, level, sigma, slopes, w):  # type: ignore[no-untyped-def]
+@kernel
+def _second_level_kernel(frame, intrinsics, rows, w, a, slopes, level, sigma):  # type: ignore[no-untyped-def]
     """The level of axis a with slopes from half-way between the estimate and the truth.
 
-    One secant step for the level that is consistent with the slopes half of it away.
+    A level is homogeneous in sigma and the slopes: it is their sum weighted with its derivatives
+    (Euler), and with other slopes it is that sum to first order. Then one secant step, to the level
+    that is consistent with the slopes half of it away.
     """
     if not 0.0 < level < math.inf:
         return level
-    _move_kernel(frame, 0.5 * level, w.directions[a], w)
-    _gradients_kernel(w.position, frame.points, w.gradients)
-    if not (_linearise_kernel(frame, intrinsics, w) and _project_kernel(w.jacobian, a, a + 1, w)):
+    elsewhere = w.elsewhere
+    _move_kernel(frame, 0.5 * level, w.directions[a], elsewhere)
+    _gradients_kernel(elsewhere.position, frame.points, w.gradients)
+    if not (
+        _linearise_kernel(frame, intrinsics, elsewhere)
+        and _project_kernel(elsewhere.jacobian, w.gradients, w.unit, a, a + 1, w.linear)
+    ):
         return math.inf
-    for s in range(slopes.shape[0]):
-        _show_kernel(hypotheses.rows[s], w)
-        slope, _ = _slope_kernel(hypotheses.rows[s], a, frame.residuals, w)
-        # The truth may lie on the other side: to this order the change there is the opposite.
-        w.slopes[s] = slopes[s] + abs(slope - slopes[s]) if slopes[s] < math.inf else math.inf
-    second, _ = _level_kernel(w.slopes, sigma + abs(w.sigma[a] - sigma), hypotheses, monitor, w)
-    return level * level / (2.0 * level - second) if second < 2.0 * level else math.inf
+    # The truth may lie on the other side: to this order the change there is the opposite.
+    bent, rest = 0.0, level
+    for s in range(rows.shape[0]):
+        if w.weights[a, s] > 0.0:
+            _show_kernel(rows[s], w.size, w.linear.visible, w.shown)
+            slope = _slope_kernel(rows[s], a, w.size, w.linear, w.shown)
+            bent += w.weights[a, s] * (slopes[s] + abs(slope - slopes[s]))
+            rest -= w.weights[a, s] * slopes[s]
+    bent += rest * (1.0 + abs(w.linear.sigma[a] / sigma - 1.0))
+    return level * level / (2.0 * level - bent) if bent < 2.0 * level else math.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _move_kernel(frame, size, direction, w):  # type: ignore[no-untyped-def]
+@kernel
+def _move_kernel(frame, size, direction, elsewhere):  # type: ignore[no-untyped-def]
     """The pose moved by `size` along `direction`, or against it: away from the points."""
-    away = 0.0
-    for a in range(3):
-        away += direction[a] * (frame.positions[a] - frame.points[:, a].mean())
+    points, position, away = frame.points, frame.positions, 0.0
+    for k in range(points.shape[0]):
+        for a in range(3):
+            away += direction[a] * (position[a] - points[k, a])
     size = math.copysign(size, away)
+    for c in range(6):
+        elsewhere.increment[c] = size * direction[c]
     for a in range(3):
-        w.position[a] = frame.positions[a] + size * direction[a]
-        w.predicted[a] = size * direction[3 + a]
-    cayley_kernel(w.predicted, w.turn)
-    product_kernel(frame.rotations, w.turn, w.rotation)
+        elsewhere.position[a] = position[a] + elsewhere.increment[a]
+    cayley_kernel(elsewhere.increment[3:], elsewhere.turn)
+    product_kernel(frame.rotations, elsewhere.turn, elsewhere.rotation)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _linearise_kernel(frame, intrinsics, w):  # type: ignore[no-untyped-def]
+@kernel
+def _linearise_kernel(frame, intrinsics, elsewhere):  # type: ignore[no-untyped-def]
     """The whitened Jacobian at the moved pose; False where a point is not in view."""
-    n, points, lines = w.jacobian.shape[0], 2 * frame.points.shape[0], 2 * frame.edges.shape[0]
-    w.jacobian[:] = frame.jacobians  # what the sensors say is linear in the pose
-    project_kernel(frame.points, w.rotation, w.position, intrinsics, w.predicted, w.jacobian, w.depth)
-    for k in range(frame.points.shape[0]):
-        if not w.depth[k] > 0.0:
+    jacobian, predicted, factor = elsewhere.jacobian, elsewhere.predicted, frame.factors
+    n, first, lines = jacobian.shape[0], 2 * frame.points.shape[0], frame.edges.shape[0]
+    project_kernel(
+        frame.points, elsewhere.rotation, elsewhere.position, intrinsics, predicted, jacobian, elsewhere.depth
+    )
+    for k in range(elsewhere.depth.shape[0]):
+        if not elsewhere.depth[k] > 0.0:
             return False
-    for i in range(lines):
-        w.predicted[points + i] = frame.lines[i // 2, i % 2]  # its sign convention
-    if lines:
-        lines_kernel(frame.edges, w.rotation, w.position, intrinsics, points, w.predicted, w.jacobian)
-    for i in range(min(points + lines, n)):
+    for k in range(lines):  # of the two forms of a line, the measured one
+        predicted[first + 2 * k], predicted[first + 2 * k + 1] = frame.lines[k, 0], frame.lines[k, 1]
+    lines_kernel(frame.edges, elsewhere.rotation, elsewhere.position, intrinsics, first, predicted, jacobian)
+    for i in range(n):
         for c in range(6):
-            total = w.jacobian[i, c]
-            for j in range(i):
-                total -= frame.factors[i, j] * w.jacobian[j, c]
-            w.jacobian[i, c] = total / frame.factors[i, i]
+            if i < first + 2 * lines:
+                total = jacobian[i, c]
+                for j in range(i):
+                    total -= factor[i, j] * jacobian[j, c]
+                jacobian[i, c] = total / factor[i, i]
+            else:  # what sensors say is linear in the pose
+                jacobian[i, c] = frame.jacobians[i, c]
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _passed_kernel(slopes, separations, monitor, thresholds):  # type: ignore[no-untyped-def]
     """Solution separation's test of one axis: |separation| ≤ K g; the false alarms in equal parts."""
     monitored, passed = 0, True
@@ -725,12 +862,16 @@ def _passed_kernel(slopes, separations, monitor, thresholds):  # type: ignore[no
     return passed
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _level_kernel(slopes, sigma, hypotheses, monitor, w):  # type: ignore[no-untyped-def]
-    """The level of one axis and its driver, once the faults that can hide are charged to the risk."""
+@kernel
+def _level_kernel(slopes, sigma, hypotheses, monitor, worst, weights):  # type: ignore[no-untyped-def]
+    """The level of one axis and its driver, once the faults that can hide are charged to the risk.
+
+    `weights` (h,) gets its derivatives by the slopes.
+    """
     risk, monitored = monitor.risk - hypotheses.unmonitored, 0
     driver, most = -2, hypotheses.unmonitored
     for s in range(slopes.shape[0]):
+        weights[s] = 0.0
         if slopes[s] < math.inf:
             monitored += 1
         else:
@@ -740,12 +881,12 @@ def _level_kernel(slopes, sigma, hypotheses, monitor, w):  # type: ignore[no-unt
     if not risk > 0.0:
         return math.inf, driver
     if monitor.separation:
-        return _separation_level_kernel(slopes, sigma, hypotheses, monitor, risk, monitored)
-    return _residual_level_kernel(slopes, sigma, hypotheses, monitor, risk, w)
+        return _separation_level_kernel(slopes, sigma, hypotheses, monitor, risk, monitored, weights)
+    return _residual_level_kernel(slopes, sigma, hypotheses, monitor, risk, worst, weights)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _separation_level_kernel(slopes, sigma, hypotheses, monitor, risk, monitored):  # type: ignore[no-untyped-def]
+@kernel
+def _separation_level_kernel(slopes, sigma, hypotheses, monitor, risk, monitored, weights):  # type: ignore[no-untyped-def]
     """Solution separation: the largest of K sigma over the hypotheses; the risk in equal parts."""
     share = risk / (monitored + 1)
     tolerated = _quantile_kernel(monitor.false_alarm_rate / max(monitored, 1))
@@ -753,49 +894,43 @@ def _separation_level_kernel(slopes, sigma, hypotheses, monitor, risk, monitored
     for s in range(slopes.shape[0]):
         if slopes[s] < math.inf and hypotheses.priors[s] > share:
             without = math.sqrt(sigma * sigma + slopes[s] * slopes[s])
-            bound = tolerated * slopes[s] + _quantile_kernel(share / hypotheses.priors[s]) * without
+            missed = _quantile_kernel(share / hypotheses.priors[s])
+            bound = tolerated * slopes[s] + missed * without
             if bound > level:
-                level, driver = bound, s
+                if driver >= 0:
+                    weights[driver] = 0.0
+                level, driver, weights[s] = bound, s, tolerated + missed * slopes[s] / without
     return level, driver
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _residual_level_kernel(slopes, sigma, hypotheses, monitor, risk, w):  # type: ignore[no-untyped-def]
+@kernel
+def _residual_level_kernel(slopes, sigma, hypotheses, monitor, risk, worst, weights):  # type: ignore[no-untyped-def]
     """The level at which the χ² test's missed errors take up the risk.
 
     In units of sigma, k = g / sigma, F(t) = P(accepted): P(no fault) (1 - rate) 2Q(x)
-    + Σ p max over t of P(|N(k t, 1)| > x) F(t) = risk. Newton on its logarithm, which is nearly
-    straight; the worst t may be held in the derivative (envelope theorem).
+    + Σ p max over t of P(|N(k t, 1)| > x) F(t) = risk. By the envelope theorem the worst t may be
+    held in the derivative by x.
     """
-    low, high, x = 0.0, 0.0, 0.0
-    share, nominal = risk / (slopes.shape[0] + 1), hypotheses.fault_free * (1.0 - monitor.false_alarm_rate)
-    for s in range(-1, slopes.shape[0]):
-        prior, k = (hypotheses.priors[s], slopes[s] / sigma) if s >= 0 else (nominal, 0.0)
-        if k < math.inf and share < prior:
-            # Q(z) ≤ exp(-z²/2) / 2 and F(t) ≤ Q(t - root of the threshold): beyond `high` no term
-            # exceeds its share.
-            reach = math.sqrt(2.0 * math.log(2.0 * prior / share))
-            high = max(high, k * (monitor.root + reach) + reach)
-            x = max(x, k * monitor.root + reach * math.sqrt(1.0 + k * k))
-    w.bias[:] = math.nan
-    w.drift[:] = 0.0
+    nominal = hypotheses.fault_free * (1.0 - monitor.false_alarm_rate)
+    low, high, x = 0.0, *_guess_kernel(slopes, sigma, hypotheses, monitor, risk, nominal)
+    worst.bias[:] = math.nan
     driver = -1
     for _ in range(200):
         tail, density = _tail_kernel(x)
         total, fall = 2.0 * nominal * tail, 2.0 * nominal * density
-        driver, most = -1, total
+        driver, most, scale = -1, total, nominal
         for s in range(slopes.shape[0]):
             if slopes[s] < math.inf:
-                chance, rate = _worst_kernel(x, slopes[s] / sigma, monitor, s, w)
-                chance, rate = hypotheses.priors[s] * chance, hypotheses.priors[s] * rate
-                total, fall = total + chance, fall + rate
-                if chance > most:
-                    driver, most = s, chance
+                chance, rate, pull = _worst_kernel(x, slopes[s] / sigma, monitor.root, monitor.acceptance, worst, s)
+                prior = hypotheses.priors[s]
+                total, fall, weights[s] = total + prior * chance, fall + prior * rate, prior * pull
+                if prior * chance > most:
+                    driver, most, scale = s, prior * chance, prior
         if total > risk:
             low = x
         else:
             high = x
-        new = x + math.log(total / risk) * total / fall
+        new = x + _step_kernel(total, fall, scale * total / most, risk)
         if not low < new < high:
             new = 0.5 * (low + high)
         step = new - x
@@ -803,31 +938,61 @@ def _residual_level_kernel(slopes, sigma, hypotheses, monitor, risk, w):  # type
         if abs(step) <= _TOLERANCE * x:
             break
         for s in range(slopes.shape[0]):
-            w.bias[s] += w.drift[s] * step
+            worst.bias[s] += worst.drift[s] * step
+    for s in range(slopes.shape[0]):
+        weights[s] /= fall
     return x * sigma, driver
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _worst_kernel(x, k, monitor, s, w):  # type: ignore[no-untyped-def]
-    """max over t of P(|N(k t, 1)| > x) F(t), and minus its derivative by x; t and dt/dx into row s.
+@kernel
+def _guess_kernel(slopes, sigma, hypotheses, monitor, risk, nominal):  # type: ignore[no-untyped-def]
+    """A bound of the level and a guess at it, in units of sigma.
+
+    As Q(z) ≤ exp(-z²/2) / 2 and F(t) ≤ Q(t - root of the threshold), beyond the bound no term
+    exceeds its equal share of the risk.
+    """
+    high, guess, share = 0.0, 0.0, risk / (slopes.shape[0] + 1)
+    for s in range(-1, slopes.shape[0]):
+        prior, k = (hypotheses.priors[s], slopes[s] / sigma) if s >= 0 else (nominal, 0.0)
+        if k < math.inf and share < prior:
+            reach = math.sqrt(2.0 * math.log(2.0 * prior / share))
+            high = max(high, k * (monitor.root + reach) + reach)
+            guess = max(guess, k * monitor.root + 0.8 * reach * math.sqrt(1.0 + k * k))
+    return high, guess
+
+
+@kernel
+def _step_kernel(total, fall, scale, target):  # type: ignore[no-untyped-def]
+    """Newton's step for total(x) = target, -fall its derivative, on the root of log(scale / total).
+
+    Of a Gaussian tail that root is nearly straight. Scale and total may not be less than target and 0.
+    """
+    height = math.sqrt(2.0 * math.log(scale / total))
+    return (math.sqrt(2.0 * math.log(max(scale / target, 1.0))) - height) * height * total / fall
+
+
+@kernel
+def _worst_kernel(x, k, root, acceptance, worst, s):  # type: ignore[no-untyped-def]
+    """max over t of P(|N(k t, 1)| > x) F(t), minus its derivative by x, and that by k; t and dt/dx into row s.
 
     Both factors are log-concave in t² (Finner & Roters 1997), so that there is one maximum.
     """
-    low, high = 0.0, _STEP * (monitor.acceptance.shape[0] - 1)
+    low, high = 0.0, _STEP * (acceptance.shape[0] - 1)
     if x - k * high > _REACH:  # no number, whatever t
-        return 0.0, 0.0
-    tail, density = _tail_kernel(x)
-    log_accepted, _, bow = _accept_kernel(0.0, monitor.acceptance)
-    if k * k * x * (density / tail if x < 30.0 else x) + bow <= 0.0:  # the best is not to show at all
-        w.bias[s] = math.nan
-        accepted = 2.0 * math.exp(log_accepted)
-        return tail * accepted, density * accepted
-    t = w.bias[s]
+        return 0.0, 0.0, 0.0
+    log_accepted, _, bow = _accept_kernel(0.0, acceptance)
+    if k * k * x * x + bow <= 0.0:  # else it pays to show, as density / tail > x
+        tail, density = _tail_kernel(x)
+        if k * k * x * density / tail + bow <= 0.0:
+            worst.bias[s] = math.nan
+            accepted = 2.0 * math.exp(log_accepted)
+            return tail * accepted, density * accepted, 0.0
+    t = worst.bias[s]
     if not 0.0 < t < high:
-        t = min((monitor.root + k * x) / (1.0 + k * k), 0.5 * high)
+        t = min((root + k * x) / (1.0 + k * k), 0.5 * high)
     for _ in range(100):
         chance, density, rise, bend = _exceed_kernel(x, k * t)
-        log_accepted, fall, bow = _accept_kernel(t, monitor.acceptance)
+        log_accepted, fall, bow = _accept_kernel(t, acceptance)
         gradient, curvature = k * rise + fall, k * k * bend + bow
         step = -gradient / curvature
         if curvature < 0.0 and step * gradient < 1e-8:
@@ -837,12 +1002,12 @@ def _worst_kernel(x, k, monitor, s, w):  # type: ignore[no-untyped-def]
         else:
             high = t
         t = t + step if curvature < 0.0 and low < t + step < high else 0.5 * (low + high)
-    w.bias[s], w.drift[s] = t + step, k * bend / curvature
+    worst.bias[s], worst.drift[s] = t + step, k * bend / curvature
     accepted = math.exp(log_accepted + 0.5 * step * gradient)  # with what the last step still brings
-    return chance * accepted, density * accepted
+    return chance * accepted, density * accepted, t * rise * chance * accepted
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _accept_kernel(t, acceptance):  # type: ignore[no-untyped-def]
     """log F, its first and its second derivative."""
     cell = min(int(t / _STEP), acceptance.shape[0] - 1)
@@ -852,7 +1017,7 @@ def _accept_kernel(t, acceptance):  # type: ignore[no-untyped-def]
     return value, (c1 + u * (2.0 * c2 + 3.0 * u * c3)) / _STEP, (2.0 * c2 + 6.0 * u * c3) / (_STEP * _STEP)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _exceed_kernel(x, u):  # type: ignore[no-untyped-def]
     """P(|N(u, 1)| > x), minus its derivative by x, and two derivatives of its logarithm by u."""
     z = x - u
@@ -868,22 +1033,22 @@ def _exceed_kernel(x, u):  # type: ignore[no-untyped-def]
     return total, density, rise, bend - rise * rise
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _tail_kernel(z):  # type: ignore[no-untyped-def]
     """P(N(0, 1) > z) and the density there."""
     return 0.5 * math.erfc(z * math.sqrt(0.5)), math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _quantile_kernel(probability):  # type: ignore[no-untyped-def]
-    """k ≥ 0 with P(|N(0, 1)| > k) = probability; 0 from a probability of 1 on. Newton on the logarithm."""
+    """k ≥ 0 with P(|N(0, 1)| > k) = probability; 0 from a probability of 1 on."""
     if not probability < 1.0:
         return 0.0
-    k = math.sqrt(-2.0 * math.log(probability))  # above, as 2Q(k) ≤ exp(-k²/2)
+    k = math.sqrt(-2.0 * math.log(probability))
     for _ in range(50):
         tail, density = _tail_kernel(k)
-        step = math.log(2.0 * tail / probability) * tail / density
+        step = _step_kernel(2.0 * tail, 2.0 * density, 1.0, probability)
         k += step
-        if abs(step) <= 1e-14 * k:
+        if abs(step) <= 1e-7 * k:  # its square is left
             break
     return k

@@ -165,6 +165,10 @@ def _figures(result: FrameResult, notes: Notes) -> list[tuple[str, str, str]]:
             value = f"{sign * position[axis]:.1f} ± {2 * sigma[axis]:.1f} m"
             error = "" if notes.truth_m is None else f"error {sign * (position[axis] - notes.truth_m[axis]):+.1f}"
             lines.append((name, value, error))
+    if result.protection is not None:
+        levels = result.protection
+        each = " / ".join(f"{level:.0f}" for level in (levels.along_m, levels.cross_m, levels.vertical_m))
+        lines.append(("level", f"{each} m", f"risk {levels.integrity_risk:.0e}"))
     if result.keypoints is not None:
         sigma_px = result.keypoints.sigma_px
         lines.append(("σ near", f"{sigma_px[:2].mean():.2f} px", f"far {sigma_px[2:].mean():.2f} px"))
