@@ -39,5 +39,5 @@ clean:
 
 .venv/dev: .venv/base
 	@echo "installing the training and development tools into .venv (once) ..."
-	$(PIP) -e ".[train,cluster]" --group dev
+	$(PIP) -e ".[train,cluster,posterior]" --group dev
 	@touch $@

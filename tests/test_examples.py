@@ -17,3 +17,8 @@ def test_window(capsys):
     assert "explained by: runway " in out
     assert " m shorter" in out
     assert "by themselves so far: 0" in out
+
+
+def test_exclude_a_corner(capsys):
+    runpy.run_path(str(EXAMPLES / "exclude_a_corner.py"))
+    assert "excluded" in capsys.readouterr().out
