@@ -157,12 +157,13 @@ def solve(
     false_alarm_rate: Rate = 1e-3,
     as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Pose and verdict from keypoints that someone else found."""
-    from shortfinal.integrity import check_integrity
+    """Pose, verdict and protection levels from keypoints, lines and priors that someone else found."""
+    from shortfinal.exclusion import exclude_faults
     from shortfinal.problem import read_problem
+    from shortfinal.protection import protection_levels
 
-    estimate = read_problem(problem).solve()
-    verdict = check_integrity(estimate, false_alarm_rate)
+    found = exclude_faults(read_problem(problem).solve(), false_alarm_rate)
+    estimate, verdict = found.estimate, found.verdict
     if estimate.pose is None or estimate.cov is None:
         raise InputError(f"{problem}: no pose: {verdict.reasons[0]}")
     record = {
@@ -170,14 +171,20 @@ def solve(
         "attitude_deg": list(estimate.pose.attitude), "cov": estimate.cov.tolist(),
         "decision": verdict.decision.value, "reasons": list(verdict.reasons),
         "statistic": verdict.statistic, "dof": verdict.dof, "p_value": verdict.p_value,
+        "excluded": list(found.excluded), "levels": None,
     }  # fmt: skip
+    # After an exclusion no level is promised; without a check there is nothing to promise it of.
+    if verdict.decision.value != "not-monitored" and not found.excluded:
+        levels = protection_levels(estimate, false_alarm_rate=false_alarm_rate)
+        record["levels"] = {axis: v if v < float("inf") else None for axis, v in levels.levels._asdict().items()}
     if as_json:
         _print_json(record)
         return
     sigma = estimate.sigma_position_m
     assert sigma is not None
-    for name, value, s in zip("xyz", estimate.pose.position_m, sigma, strict=True):
-        console.print(f"{name}  {value:12.3f} ± {2 * s:.3f} m (2σ)")
+    for axis, (name, value, s) in enumerate(zip("xyz", estimate.pose.position_m, sigma, strict=True)):
+        level = "" if record["levels"] is None else f", level {levels.levels[axis]:.3g} m"
+        console.print(f"{name}  {value:12.3f} ± {2 * s:.3f} m (2σ){level}")
     console.print("yaw {:.3f}, pitch {:.3f}, roll {:.3f} degrees".format(*estimate.pose.attitude))
     console.print(f"{verdict.decision.value}: {'; '.join(verdict.reasons)}", style=_STYLES[verdict.decision.value])
 
@@ -379,7 +386,7 @@ def _table(title: str, columns: tuple[str, ...]) -> Table:
 
 
 def _demo_table(frames: Iterable[Flown]) -> Table:
-    table = _table("", ("frame", "distance", "height", "error", "up", "σ px", "p", "verdict", "fault"))
+    table = _table("", ("frame", "distance", "height", "error", "up", "level", "σ px", "p", "verdict", "fault"))
     for f in frames:
         estimate, keypoints = f.result.estimate, f.result.keypoints
         cells = ["–"] * 4
@@ -389,10 +396,11 @@ def _demo_table(frames: Iterable[Flown]) -> Table:
             sx, _, sz = 2 * sigma_m
             along, _, vertical = f.error_m
             cells = [f"{-x:.0f} ±{sx:.0f}", f"{z:.0f} ±{sz:.1f}", f"{along:+.1f}", f"{vertical:+.1f}"]
+        level = "–" if f.result.protection is None else f"{f.result.protection.vertical_m:.0f}"
         sigma = "–" if keypoints is None else f"{keypoints.sigma_px.mean():.2f}"
         p, decision = f.result.verdict.p_value, f.result.verdict.decision.value
         table.add_row(
-            str(f.number), *cells, sigma, "–" if p is None else f"{p:.0e}",
+            str(f.number), *cells, level, sigma, "–" if p is None else f"{p:.0e}",
             Text(decision, style=_STYLES[decision]), Text(_FAULT_WORDS[f.fault.name], style="yellow"),
         )  # fmt: skip
     return table
