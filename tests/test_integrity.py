@@ -236,6 +236,38 @@ def test_a_corner_that_is_hardly_known_leaves_nothing_to_check():
     assert not check_integrity_batch(estimate_pose_batch(px[None], cov, RUNWAY.corners, CAMERA)).monitored[0]
 
 
+def test_priors_that_say_nothing_are_no_redundancy():
+    px = sf.project(CAMERA, on_approach(1200), RUNWAY.corners)
+    kp, points = sf.GaussianKeypoints.from_sigma(px[:3], 0.5), RUNWAY.corners[:3]
+    attitude, position = on_approach(1200).runway_from_camera, on_approach(1200).position_m
+
+    def decision(**priors):
+        return sf.check_integrity(sf.estimate_pose(kp, points, CAMERA, **priors)).decision
+
+    vague = {"attitude_prior": (attitude, 2.0 * np.eye(3)), "position_prior": (position, 1e8 * np.eye(3))}
+    assert decision(**vague, altitude=(position[2], 1e4)) is Decision.NOT_MONITORED
+    for sharp in (
+        {"attitude_prior": (attitude, 1e-4 * np.eye(3))},
+        {"position_prior": (position, 25.0 * np.eye(3))},
+        {"altitude": (position[2], 1.0)},
+    ):
+        assert decision(**sharp) is Decision.USE
+
+
+def test_a_bias_of_a_prior_moves_the_pose():
+    est = estimate()
+    height = est.pose.position_m[2]
+    with_height = sf.estimate_pose(est.keypoints, RUNWAY.corners, CAMERA, altitude=(height, 1.0))
+    bias = np.zeros(9)
+    bias[8] = 0.1
+    moved = sf.estimate_pose(est.keypoints, RUNWAY.corners, CAMERA, altitude=(height + 0.1, 1.0))
+    expected = moved.pose.minus(with_height.pose)
+    np.testing.assert_allclose(bias_effect(with_height, bias), expected, rtol=1e-2, atol=1e-2 * abs(expected[2]))
+    # A shift of the keypoints alone has no part in the other rows.
+    shift = np.append(FAULTS[0].ravel(), 0.0)
+    np.testing.assert_array_equal(bias_effect(with_height, FAULTS[0]), bias_effect(with_height, shift))
+
+
 def test_a_pose_too_uncertain_for_a_linear_test_is_not_monitored():
     est = solve(sf.project(CAMERA, on_approach(4000), RUNWAY.corners), sigma=15.0)
     verdict = sf.check_integrity(est)

@@ -141,6 +141,65 @@ def test_two_upright_optima_are_ambiguous_until_the_pixels_are_sharp_enough():
     assert np.abs(sharp.pose.minus(OVER_PAD)[:3]).max() < 1e-3
 
 
+@pytest.mark.parametrize("camera", [CAMERA, WIDE], ids=["pinhole", "distorted"])
+@pytest.mark.parametrize("kept", [[0, 1, 2], [2, 0, 3], [1, 2, 3], [3, 1, 0]])
+def test_three_points_fix_a_pose_and_leave_nothing_to_check(camera, kept):
+    rng = np.random.default_rng(8)
+    for distance in np.geomspace(100, 4000, 12):
+        truth = on_approach(distance, **dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), rng.uniform(-8, 8, 3))))
+        px = sf.project(camera, truth, RUNWAY.corners)[kept]
+        est = solve(px, RUNWAY.corners[kept], camera)
+        assert est.status is SolverStatus.CONVERGED
+        assert est.dof == 0
+        assert np.abs(est.pose.minus(truth) / np.sqrt(np.diag(est.cov))).max() < 1e-4
+        # Any other image of three points has a pose as well, and no residual.
+        assert solve(px + rng.normal(size=(3, 2)), RUNWAY.corners[kept], camera).chi2 < 1e-9
+        assert sf.check_integrity(est).decision is sf.Decision.NOT_MONITORED
+
+
+def test_three_points_with_several_poses_are_ambiguous():
+    # Grunert's quartic has two roots here with the camera above the pad and upright, and both fit exactly.
+    px = sf.project(FISH, OVER_PAD, PAD[:3])
+    est = solve(px, PAD[:3], FISH)
+    assert est.status is SolverStatus.AMBIGUOUS
+    assert est.chi2 < 1e-9
+    known = solve(px, PAD[:3], FISH, attitude_prior=(OVER_PAD.runway_from_camera, 1e-6 * np.eye(3)))
+    assert known.status is SolverStatus.CONVERGED
+    assert np.abs(known.pose.minus(OVER_PAD)[:3]).max() < 1e-3
+
+
+def test_points_in_space_need_no_plane():
+    rng = np.random.default_rng(9)
+    for count in (4, 5, 8):
+        for _ in range(20):
+            truth = on_approach(rng.uniform(300, 1500), roll_deg=rng.uniform(-30, 30))
+            points = rng.uniform([0, -100, 0], [800, 100, 60], (count, 3))
+            points[1] = 0.5 * (points[0] + points[2])  # three on a line
+            est = solve(sf.project(CAMERA, truth, points), points)
+            # Four of which three lie on a line are a plane, with its second pose.
+            assert est.status is SolverStatus.CONVERGED or count == 4
+            assert np.abs(est.pose.minus(truth) / np.sqrt(np.diag(est.cov))).max() < 1e-5
+
+
+def test_points_on_a_line_and_a_position_fix_the_attitude():
+    truth = on_approach(1000, yaw_deg=2, pitch_deg=-2, roll_deg=5)
+    px, prior = sf.project(CAMERA, truth, LINE), (truth.position_m, 4.0 * np.eye(3))
+    est = solve(px, LINE, position_prior=prior)
+    assert est.status is SolverStatus.CONVERGED
+    assert np.abs(est.pose.minus(truth) / np.sqrt(np.diag(est.cov))).max() < 1e-4
+
+
+def test_points_that_are_read_only_are_used_as_they_are_and_checked_all_the_same():
+    px = sf.project(CAMERA, on_approach(1000), RUNWAY.corners)
+    assert solve(px).points is RUNWAY.corners
+    points = RUNWAY.corners.copy()
+    assert solve(px, points).points is not points
+    points[2, 1] = np.nan
+    points.setflags(write=False)
+    with pytest.raises(sf.InputError, match=r"points: entry \[2, 1\] is nan"):
+        solve(px, points)
+
+
 LINE = np.array([[0.0, 0, 0], [500, 0, 0], [1000, 0, 0], [2000, 0, 0]])
 
 

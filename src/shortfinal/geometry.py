@@ -22,8 +22,11 @@ Array = NDArray[np.float64]
 BODY_FROM_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 # A compiled function. Without numba's runtime nothing can be allocated in it, which is a promise of
-# the solver's, and no references are counted, which would cost it half of its time.
+# the solver's, and no references are counted, which would cost it half of its time. (So a function
+# that does have the runtime must not take an array back from one of these: numbers only.)
 kernel: Any = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+# For a kernel that takes long tuples and is called in one place: a call copies them.
+inlined: Any = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, forceinline=True)  # type: ignore[call-overload]
 
 _DISTORTION_LENGTHS = (0, 4, 5, 8)
 _FOLDED = 1e-6  # Jacobian determinant of the distortion beyond the radius where it is one-to-one

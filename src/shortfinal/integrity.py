@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,7 +78,7 @@ def check_integrity(est: PoseEstimate, false_alarm_rate: float = FALSE_ALARM_RAT
     obstacle = _obstacle(est)
     if obstacle:
         return IntegrityVerdict(Decision.NOT_MONITORED, (obstacle,), est.dof, false_alarm_rate)
-    p, threshold = float(chdtrc(est.dof, est.chi2)), float(chdtri(est.dof, false_alarm_rate))
+    p, threshold = float(chdtrc(est.dof, est.chi2)), _threshold(est.dof, false_alarm_rate)
     refused = p < false_alarm_rate
     if refused:
         reason = (
@@ -97,7 +98,7 @@ def check_integrity_batch(batch: PoseEstimateBatch, false_alarm_rate: float = FA
     statistic = np.where(monitored, batch.chi2, np.nan)
     dof = batch.dof
     p = np.asarray(chdtrc(dof, statistic)) if dof > 0 else np.full(len(batch), np.nan)
-    threshold = float(chdtri(dof, false_alarm_rate)) if dof > 0 else math.nan
+    threshold = _threshold(dof, false_alarm_rate) if dof > 0 else math.nan
     return IntegrityBatch(
         monitored, monitored & (p >= false_alarm_rate), statistic, p, dof, threshold, false_alarm_rate
     )
@@ -143,7 +144,7 @@ def detection_probability(est: PoseEstimate, bias_px: ArrayLike, false_alarm_rat
     for a rate outside (0, 1), or where the estimate is not monitored.
     """
     check_rate(false_alarm_rate, "false_alarm_rate")
-    threshold = float(chdtri(_solved(est).dof, false_alarm_rate))
+    threshold = _threshold(_solved(est).dof, false_alarm_rate)
     from scipy.stats import ncx2  # its survival function does not saturate; slow to import
 
     noncentrality = _noncentrality(est, bias_px)
@@ -165,7 +166,7 @@ def minimal_detectable_bias(
     check_rate(false_alarm_rate, "false_alarm_rate")
     if not false_alarm_rate < power < 1:
         raise InputError(f"power: {power} must lie between the false-alarm rate {false_alarm_rate} and 1")
-    threshold = float(chdtri(_solved(est).dof, false_alarm_rate))
+    threshold = _threshold(_solved(est).dof, false_alarm_rate)
     needed = float(chndtrinc(threshold, est.dof, 1.0 - power))
     unit = _noncentrality(est, direction_px)
     # Below the rounding of the projection the share left over is none.
@@ -179,6 +180,12 @@ def check_rate(rate: float, name: str) -> None:
     """Raises InputError unless `rate` is a number between 0 and 1."""
     if not (isinstance(rate, (int, float)) and 0 < rate < 1):
         raise InputError(f"{name}: {rate} is no probability; it must lie between 0 and 1, e.g. {FALSE_ALARM_RATE}")
+
+
+@lru_cache
+def _threshold(dof: int, rate: float) -> float:
+    """What χ²(dof) exceeds with probability `rate`."""
+    return float(chdtri(dof, rate))
 
 
 def _obstacle(est: PoseEstimate) -> str | None:

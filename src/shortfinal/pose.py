@@ -40,6 +40,7 @@ from shortfinal.geometry import (
     cayley_kernel,
     copy_kernel,
     frozen,
+    inlined,
     kernel,
     lines_kernel,
     log_kernel,
@@ -51,6 +52,7 @@ from shortfinal.keypoints import GaussianKeypoints
 from shortfinal.starts import (
     carve_kernel,
     flatten_kernel,
+    further_starts_kernel,
     known_attitude_start_kernel,
     known_position_start_kernel,
     level_start_kernel,
@@ -552,13 +554,20 @@ _SINGULAR = 1e-12
 # of a standard deviation: δᵀJᵀJδ under this.
 _STEP_TOLERANCE = 1e-12
 _FIRST_DAMPING = 1e-3
+# A position known no better than to three times the distance, or an attitude to 0.7 rad, is free:
+# the cost levels out towards infinity, and so flat an optimum has others about it.
+_FREE_SHARE = 3.0
+_FREE_TURN = 0.7
 # Attitude known to this (rad, 1σ) rules out an optimum that hangs upside down. Measured: of 80,000
 # noisy runways none with a second optimum was known to better than 0.14 rad.
 _SURE_TURN = 0.05
-# A cost that noise exceeds once in e^16 = 9 million times (see _plausible_kernel) asks for more starts.
+# A cost that noise exceeds once in e^16 = 9 million times (see _settled_kernel) asks for more starts.
 _IMPLAUSIBLE = 16.0
 _LOWEST, _RIVAL, _STATUS, _STEPS, _SURE = range(5)  # of the tally of a search
 _TALLY = 5
+# Kinds of starts, in the order of their turns; those after _PLANE are for three points and for doubts.
+_GIVEN, _ATTITUDE, _PLANE, _TRIANGLE, _WITHOUT_LINES, _POSITION, _LEVEL, _FURTHER = range(8)
+_KINDS = 8
 
 
 class _Problem(NamedTuple):
@@ -574,7 +583,7 @@ class _Problem(NamedTuple):
     attitude_factor: Any  # (3, 3)
     position_factor: Any  # (3, 3)
     attitude: Any  # (3, 3) runway_from_camera of the prior
-    numbers: Any  # (2,) 1 / sigma of the altitude; whether the keypoints' coordinates are independent
+    numbers: Any  # (3,) 1 / sigma of the altitude; whether the pixels are independent, and the lines count
     turn: Any  # (3, 3) scratch
     depth: Any  # (K,) scratch
 
@@ -583,7 +592,7 @@ class _State(NamedTuple):
     """A pose, the whitened residual and Jacobian there, and what follows from them."""
 
     whole: Any  # all numbers
-    rows: Any  # those of the next four
+    rows: Any  # those of the next four fields
     rotation: Any  # (3, 3)
     position: Any  # (3,)
     residual: Any  # (n,)
@@ -591,41 +600,42 @@ class _State(NamedTuple):
     normal: Any  # (6, 6) JᵀJ, lower triangle
     gradient: Any  # (6,) Jᵀr
     factor: Any  # (6, 6) of JᵀJ, damped or not, as _cholesky_kernel leaves it
+    inverse: Any  # (6, 6) L⁻¹ of the last factor
     step: Any  # (6,)
 
 
 def _work_size(k: int, lines: int, rows: int) -> int:
     """Numbers that `_solve_kernel` works in."""
-    problem = rows + 4 * k * k + 4 * lines * lines + 9 + 9 + 9 + 2 + 9 + k
-    return problem + 3 * (96 + 7 * rows) + scratch_size(k) + _TALLY
+    problem = rows + 4 * k * k + 4 * lines * lines + 9 + 9 + 9 + 3 + 9 + k
+    return problem + 3 * (132 + 7 * rows) + scratch_size(k) + _TALLY
 
 
-@kernel
+@inlined
 def _problem_kernel(points, edges, lens, priors, rows, work):  # type: ignore[no-untyped-def]
     """A problem in the first part of `work`, and where that part ends."""
     k, lines = points.shape[0], edges.shape[0]
     a = rows + 4 * k * k
     b = a + 4 * lines * lines
-    end = b + 38 + k
+    end = b + 39 + k
     return _Problem(
         points, edges, lens, priors, work[:rows], work[rows:a].reshape(2 * k, 2 * k),
         work[a:b].reshape(2 * lines, 2 * lines), work[b : b + 9].reshape(3, 3), work[b + 9 : b + 18].reshape(3, 3),
-        work[b + 18 : b + 27].reshape(3, 3), work[b + 27 : b + 29], work[b + 29 : b + 38].reshape(3, 3),
-        work[b + 38 : end],
+        work[b + 18 : b + 27].reshape(3, 3), work[b + 27 : b + 30], work[b + 30 : b + 39].reshape(3, 3),
+        work[b + 39 : end],
     ), end  # fmt: skip
 
 
-@kernel
+@inlined
 def _state_kernel(work, start, rows):  # type: ignore[no-untyped-def]
     """A state in `work` from `start` on, and where it ends."""
     a = start + 12
     b = a + rows
     c = b + 6 * rows
-    end = c + 84
+    end = c + 120
     return _State(
         work[start:end], work[start:c], work[start : start + 9].reshape(3, 3), work[start + 9 : a],
         work[a:b], work[b:c].reshape(rows, 6), work[c : c + 36].reshape(6, 6), work[c + 36 : c + 42],
-        work[c + 42 : c + 78].reshape(6, 6), work[c + 78 : end],
+        work[c + 42 : c + 78].reshape(6, 6), work[c + 78 : c + 114].reshape(6, 6), work[c + 114 : end],
     ), end  # fmt: skip
 
 
@@ -673,7 +683,7 @@ def _solve_kernel(  # type: ignore[no-untyped-def]
         copy_kernel(best.rotation.reshape(9), rotation_out.reshape(9))
         copy_kernel(best.residual, residual_out)
         copy_kernel(best.jacobian.reshape(6 * rows), jacobian_out.reshape(6 * rows))
-        _covariance_kernel(best.factor, best.normal, cov_out)
+        _covariance_kernel(best.inverse, cov_out)
         summary[3], summary[4] = _sharpness_kernel(problem, best.position, cov_out, cov, line_cov, attitude, position)
     else:
         position_out[:] = math.nan
@@ -684,14 +694,14 @@ def _solve_kernel(  # type: ignore[no-untyped-def]
         summary[1], summary[3], summary[4] = math.nan, 0.0, math.nan
 
 
-@kernel
+@inlined
 def _admit_kernel(problem, mean, cov, line_mean, line_cov, attitude, position, altitude, initial):  # type: ignore[no-untyped-def]
     """Take in what was measured, and factor its covariances; refuse NaN, infinity and what is no covariance."""
     measured, row = problem.measured, 2 * (mean.shape[0] + line_mean.shape[0])
     copy_kernel(mean.reshape(mean.size), measured)
     copy_kernel(line_mean.reshape(line_mean.size), measured[2 * mean.shape[0] :])
     good, independent = _factor_kernel(cov, problem.keypoint_factor)
-    problem.numbers[1] = independent
+    problem.numbers[1], problem.numbers[2] = independent, 1.0
     finite = (
         _finite_kernel(cov) and _finite_kernel(line_cov) and _finite_kernel(problem.points) and _finite_kernel(initial)
     )
@@ -765,42 +775,52 @@ def _is_rotation_kernel(r):  # type: ignore[no-untyped-def]
     return x * r[0, 2] + y * r[1, 2] + z * r[2, 2] > 0.0
 
 
-@kernel
+@inlined
 def _search_kernel(problem, position, initial, max_iterations, scratch, best, current, trial, tally):  # type: ignore[no-untyped-def]
-    """Refine start after start, until one settles the matter; the lowest physical optimum is in `best`."""
-    points, rotations, positions = problem.points, scratch.rotations, scratch.positions
+    """Refine start after start, until the matter is settled; the lowest physical optimum is in `best`.
+
+    One loop, so that the refinement is compiled into one place only.
+    """
     tally[_STATUS] = _NON_FINITE
     seen = flatten_kernel(problem.measured, problem.lens, scratch.image)
-    if initial.shape[0] > 0:
-        copy_kernel(initial[0, :9], rotations[0].reshape(9))
-        copy_kernel(initial[0, 9:], positions[0])
-        _try_kernel(1, problem, max_iterations, scratch, best, current, trial, tally)
-    if problem.priors[0] > 0 and seen:
-        count = known_attitude_start_kernel(points, problem.attitude, scratch, rotations, positions)
-        _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally)
-    if points.shape[0] > 3 and seen:
-        count = planar_starts_kernel(points, scratch, rotations, positions)
-        _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally)
-    if points.shape[0] == 3 or not _settled_kernel(tally, problem):
-        _search_on_kernel(problem, position, seen, max_iterations, scratch, best, current, trial, tally)
+    for kind in range(_KINDS):
+        # Three points may have four poses, all of which fit.
+        if (
+            kind > _PLANE
+            and not (kind == _TRIANGLE and problem.points.shape[0] == 3)
+            and _settled_kernel(tally, problem)
+        ):
+            break
+        count = _starts_kernel(kind, problem, position, initial, seen, scratch, best, tally)
+        _try_kernel(kind, count, problem, max_iterations, scratch, best, current, trial, tally)
     if tally[_STATUS] == _CONVERGED and tally[_RIVAL] - tally[_LOWEST] < AMBIGUITY_CHI2:
         tally[_STATUS] = _AMBIGUOUS
 
 
 @kernel
-def _search_on_kernel(problem, position, seen, max_iterations, scratch, best, current, trial, tally):  # type: ignore[no-untyped-def]
-    """The starts for three points, and for when those of the plane leave a doubt."""
+def _starts_kernel(kind, problem, position, initial, seen, scratch, best, tally):  # type: ignore[no-untyped-def]
+    """Starts of one kind into `scratch`; how many."""
     points, rotations, positions = problem.points, scratch.rotations, scratch.positions
-    i, j, k = widest_triple_kernel(points)
-    if seen and k != i:
-        count = three_point_starts_kernel(points, i, j, k, scratch, rotations, positions)
-        _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally)
-    if seen and problem.priors[1] > 0:
-        count = known_position_start_kernel(points, position[0, :3], scratch, rotations, positions)
-        _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally)
-    if not _settled_kernel(tally, problem):
-        count = level_start_kernel(points, math.tan(math.radians(3.0)), scratch, rotations, positions)
-        _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally)
+    if kind == _GIVEN and initial.shape[0] > 0:
+        copy_kernel(initial[0, :9], rotations[0].reshape(9))
+        copy_kernel(initial[0, 9:], positions[0])
+        return 1
+    if kind == _LEVEL:
+        return level_start_kernel(points, math.tan(math.radians(3.0)), scratch, rotations, positions)
+    if kind == _FURTHER and tally[_STATUS] == _CONVERGED:
+        return further_starts_kernel(points, best.rotation, best.position, rotations, positions)
+    if not seen:  # by this lens
+        return 0
+    if kind == _ATTITUDE and problem.priors[0] > 0:
+        return known_attitude_start_kernel(points, problem.attitude, scratch, rotations, positions)
+    if (kind == _PLANE or (kind == _WITHOUT_LINES and problem.edges.shape[0] > 0)) and points.shape[0] > 3:
+        return planar_starts_kernel(points, scratch, rotations, positions)
+    if kind == _TRIANGLE:
+        i, j, k = widest_triple_kernel(points)
+        return three_point_starts_kernel(points, i, j, k, scratch, rotations, positions) if k != i else 0
+    if kind == _POSITION and problem.priors[1] > 0:
+        return known_position_start_kernel(points, position[0, :3], scratch, rotations, positions)
+    return 0
 
 
 @kernel
@@ -814,19 +834,25 @@ def _settled_kernel(tally, problem):  # type: ignore[no-untyped-def]
     return tally[_STATUS] == _CONVERGED and tally[_SURE] > 0.0 and tally[_LOWEST] < most
 
 
-@kernel
-def _try_kernel(count, problem, max_iterations, scratch, best, current, trial, tally):  # type: ignore[no-untyped-def]
+@inlined
+def _try_kernel(kind, count, problem, max_iterations, scratch, best, current, trial, tally):  # type: ignore[no-untyped-def]
     """Refine the first `count` starts of `scratch`.
 
     IPPE's second start is, for a runway, an upside-down view, and slow to refine. Once the first
     has led to a physical optimum with well-known attitude the other cannot lead to one as well.
+
+    Lines mislead from far off: where a line turns by 90° against the one measured the cost has a
+    jump, and optima behind it. Starts of the kind _WITHOUT_LINES are refined by all else first.
     """
+    outcome, cost, steps = _NON_FINITE, math.nan, 0
     for s in range(count):
         if tally[_SURE] > 0.0 and not physical_kernel(scratch.rotations[s], scratch.positions[s]):
             continue
         copy_kernel(scratch.rotations[s].reshape(9), current.rotation.reshape(9))
         copy_kernel(scratch.positions[s], current.position)
-        outcome, cost, steps = _refine_kernel(problem, current, trial, max_iterations)
+        for lines in range(0 if kind == _WITHOUT_LINES else 1, 2):
+            problem.numbers[2] = lines
+            outcome, cost, steps = _refine_kernel(problem, current, trial, max_iterations)
         tally[_STATUS], tally[_STEPS] = min(tally[_STATUS], outcome), tally[_STEPS] + steps
         if outcome != _CONVERGED:
             continue
@@ -835,22 +861,20 @@ def _try_kernel(count, problem, max_iterations, scratch, best, current, trial, t
             if distinct:
                 tally[_RIVAL] = tally[_LOWEST]
             tally[_LOWEST] = cost
-            tally[_SURE] = 1.0 if _turn_variance_kernel(current.factor) < _SURE_TURN**2 else 0.0
+            tally[_SURE] = 1.0 if _variance_kernel(current.inverse, 3) < _SURE_TURN**2 else 0.0
             copy_kernel(current.whole, best.whole)
         elif distinct:
             tally[_RIVAL] = min(tally[_RIVAL], cost)
 
 
 @kernel
-def _turn_variance_kernel(factor):  # type: ignore[no-untyped-def]
-    """Sum of the three variances of the rotation, rad².
-
-    The last rows of the factor of JᵀJ are the factor of the rotation's marginal information. Its
-    diagonal entries are stored as their reciprocals a, c, f.
-    """
-    a, b, c = factor[3, 3], factor[4, 3], factor[4, 4]
-    d, e, f = factor[5, 3], factor[5, 4], factor[5, 5]
-    return a * a + c * c + f * f + (b * a * c) ** 2 + (e * c * f) ** 2 + ((b * e * c - d) * a * f) ** 2
+def _variance_kernel(inverse, first):  # type: ignore[no-untyped-def]
+    """Sum of three variances from the `first` on: of the columns of L⁻¹, the squares."""
+    total = 0.0
+    for i in range(first, 6):
+        for j in range(first, first + 3):
+            total += inverse[i, j] ** 2
+    return total
 
 
 @kernel
@@ -865,20 +889,27 @@ def _separation_kernel(one, other):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _covariance_kernel(factor, w, out):  # type: ignore[no-untyped-def]
-    """(JᵀJ)⁻¹ = L⁻ᵀ L⁻¹, by way of w = L⁻¹."""
+def _invert_kernel(factor, inverse):  # type: ignore[no-untyped-def]
+    """L⁻¹ of a factor (6, 6), as _cholesky_kernel leaves it; zero above the diagonal."""
     for j in range(6):
-        w[j, j] = factor[j, j]
+        for i in range(j):
+            inverse[i, j] = 0.0
+        inverse[j, j] = factor[j, j]
         for i in range(j + 1, 6):
             total = 0.0
             for k in range(j, i):
-                total -= factor[i, k] * w[k, j]
-            w[i, j] = total * factor[i, i]
+                total -= factor[i, k] * inverse[k, j]
+            inverse[i, j] = total * factor[i, i]
+
+
+@kernel
+def _covariance_kernel(inverse, out):  # type: ignore[no-untyped-def]
+    """(JᵀJ)⁻¹ = L⁻ᵀ L⁻¹."""
     for i in range(6):
         for j in range(i + 1):
             total = 0.0
             for k in range(i, 6):
-                total += w[k, i] * w[k, j]
+                total += inverse[k, i] * inverse[k, j]
             out[i, j] = total
             out[j, i] = total
 
@@ -910,7 +941,7 @@ def _sharpness_kernel(problem, position, cov, keypoint_cov, line_cov, attitude, 
     return sharp, math.sqrt((cov[0, 0] + cov[1, 1] + cov[2, 2]) / nearest)
 
 
-@kernel
+@inlined
 def _refine_kernel(problem, current, trial, max_iterations):  # type: ignore[no-untyped-def]
     """Gauss-Newton from the current pose, damped where it does not descend: outcome, cost, steps."""
     cost = _evaluate_kernel(problem, current)
@@ -923,8 +954,9 @@ def _refine_kernel(problem, current, trial, max_iterations):  # type: ignore[no-
         size = _step_kernel(current, damping)
         _move_kernel(current, trial, problem.turn)
         tried = _evaluate_kernel(problem, trial)
-        # The second term: below the rounding of the cost no decrease can be seen.
-        if size < _STEP_TOLERANCE + 1e-15 * cost:
+        # The second term: below the rounding of the cost no decrease can be seen. A step that damping
+        # has made short proves nothing.
+        if damping < 1.0 and size < _STEP_TOLERANCE + 1e-15 * cost:
             outcome = _CONVERGED
         if tried < cost:
             if size * size < _STEP_TOLERANCE * last:  # sizes are squares: the next is about size² / last
@@ -935,21 +967,29 @@ def _refine_kernel(problem, current, trial, max_iterations):  # type: ignore[no-
             _normal_kernel(current)
         else:
             last, damping = 0.0, max(10.0 * damping, _FIRST_DAMPING)
-    return _judge_kernel(current, outcome), cost, iteration
+    return _judge_kernel(problem, current, outcome), cost, iteration
 
 
-@kernel
-def _judge_kernel(current, outcome):  # type: ignore[no-untyped-def]
+@inlined
+def _judge_kernel(problem, current, outcome):  # type: ignore[no-untyped-def]
     """What the end of a refinement is worth: is it determined, and is it physical?"""
     copy_kernel(current.normal.reshape(36), current.factor.reshape(36))
     if not _cholesky_kernel(current.factor, _SINGULAR):
+        return _ILL_CONDITIONED
+    square = 0.0
+    for a in range(3):
+        square += (problem.points[0, a] - current.position[a]) ** 2
+    _invert_kernel(current.factor, current.inverse)
+    if not _variance_kernel(current.inverse, 0) < _FREE_SHARE**2 * square:
+        return _ILL_CONDITIONED
+    if not _variance_kernel(current.inverse, 3) < _FREE_TURN**2:
         return _ILL_CONDITIONED
     if outcome == _CONVERGED and not physical_kernel(current.rotation, current.position):
         return _BEHIND_CAMERA
     return outcome
 
 
-@kernel
+@inlined
 def _step_kernel(state, damping):  # type: ignore[no-untyped-def]
     """Solve (JᵀJ + damping diag JᵀJ) δ = Jᵀr (Marquardt 1963); returns δᵀJᵀJδ."""
     normal, factor, gradient, step = state.normal, state.factor, state.gradient, state.step
@@ -968,7 +1008,7 @@ def _step_kernel(state, damping):  # type: ignore[no-untyped-def]
     return size
 
 
-@kernel
+@inlined
 def _move_kernel(current, trial, turn):  # type: ignore[no-untyped-def]
     """The pose moved by the step: p + δp, and R exp(δθ) to second order."""
     cayley_kernel(current.step[3:], turn)
@@ -977,7 +1017,7 @@ def _move_kernel(current, trial, turn):  # type: ignore[no-untyped-def]
         trial.position[a] = current.position[a] + current.step[a]
 
 
-@kernel
+@inlined
 def _evaluate_kernel(problem, state):  # type: ignore[no-untyped-def]
     """Whitened residual and Jacobian at the pose; the cost, infinite with a point behind the camera."""
     rotation, position, residual, jacobian = state.rotation, state.position, state.residual, state.jacobian
@@ -1003,11 +1043,16 @@ def _evaluate_more_kernel(problem, state, row):  # type: ignore[no-untyped-def]
     """The rows of lines and priors, from `row` on."""
     measured, residual, jacobian = problem.measured, state.residual, state.jacobian
     if problem.edges.shape[0] > 0:
-        for i in range(row, row + 2 * problem.edges.shape[0]):
-            residual[i] = measured[i]
-        lines_kernel(problem.edges, state.rotation, state.position, problem.lens, row, residual, jacobian)
-        _whiten_kernel(problem.line_factor, measured, row, residual, jacobian)
-        row += 2 * problem.edges.shape[0]
+        end = row + 2 * problem.edges.shape[0]
+        if problem.numbers[2] > 0.0:
+            for i in range(row, end):
+                residual[i] = measured[i]
+            lines_kernel(problem.edges, state.rotation, state.position, problem.lens, row, residual, jacobian)
+            _whiten_kernel(problem.line_factor, measured, row, residual, jacobian)
+        else:
+            residual[row:end] = 0.0
+            jacobian[row:end] = 0.0
+        row = end
     jacobian[row:] = 0.0
     if problem.priors[0] > 0:
         _attitude_rows_kernel(problem, state.rotation, residual[row:], jacobian[row:])
@@ -1081,7 +1126,7 @@ def _whiten_kernel(factor, measured, first, residual, jacobian):  # type: ignore
         jacobian[row, 3], jacobian[row, 4], jacobian[row, 5] = d * scale, e * scale, f * scale
 
 
-@kernel
+@inlined
 def _normal_kernel(state):  # type: ignore[no-untyped-def]
     """JᵀJ and Jᵀr."""
     jacobian, residual = state.jacobian, state.residual

@@ -81,7 +81,8 @@ class Runway:
         leftward = 0.5 + np.array([1, -1, -1, 1])[:, None] * half / self.width_m
         near_left, near_right, far_right, far_left = self.corners
         left, right = near_left + along * (far_left - near_left), near_right + along * (far_right - near_right)
-        return right + leftward * (left - right)
+        marking: Array = right + leftward * (left - right)
+        return marking
 
     @classmethod
     def from_corners_wgs84(cls, corners: ArrayLike, ident: str = "") -> Runway:

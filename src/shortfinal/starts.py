@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from shortfinal.geometry import copy_kernel, kernel, normalise_kernel
 
-MOST_STARTS = 4  # of one kernel
+MOST_STARTS = 5  # of one kernel
 
 
 class Scratch(NamedTuple):
@@ -25,8 +25,8 @@ class Scratch(NamedTuple):
     tilt: Any  # (3, 3)
     rays: Any  # (3, 3) of three keypoints, unit length
     roots: Any  # (4,) of the quartic
-    rotations: Any  # (4, 3, 3) the starts
-    positions: Any  # (4, 3)
+    rotations: Any  # (5, 3, 3) the starts
+    positions: Any  # (5, 3)
 
 
 def scratch_size(k: int) -> int:
@@ -138,8 +138,8 @@ def known_attitude_start_kernel(points, attitude, w, rotations, positions):  # t
 
 @kernel
 def known_position_start_kernel(points, position, w, rotations, positions):  # type: ignore[no-untyped-def]
-    """The attitude at which a camera at the given position sees two of the points, those whose
-    directions differ most from one another as far as one looks from the first (TRIAD); 0 or 1.
+    """The attitude at which a camera at the given position sees the first point, and that farthest
+    from it in the image, where they are (TRIAD; Black 1964); 0 or 1.
     """
     first, second = 0, _farthest_kernel(w.image, 0)
     if second == first:
@@ -162,6 +162,31 @@ def level_start_kernel(points, slope, w, rotations, positions):  # type: ignore[
     _basis_kernel(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, rotations[0])
     positions[0, 0], positions[0, 1], positions[0, 2] = x - along - distance, y, points[0, 2] + distance * slope
     return 1
+
+
+@kernel
+def further_starts_kernel(points, rotation, position, rotations, positions):  # type: ignore[no-untyped-def]
+    """Where else the optimum may be, given one: nearer or farther on the line to the nearest point,
+    or at the other end of the runway, looking back; 5.
+    """
+    nearest, least = 0, math.inf
+    for i in range(points.shape[0]):
+        square = 0.0
+        for a in range(3):
+            square += (points[i, a] - position[a]) ** 2
+        if square < least:
+            nearest, least = i, square
+    for s in range(5):
+        copy_kernel(rotation.reshape(9), rotations[s].reshape(9))
+        for a in range(3):
+            scale = 0.25 if s == 0 else (0.5 if s == 1 else (2.0 if s == 2 else 4.0))
+            positions[s, a] = points[nearest, a] + scale * (position[a] - points[nearest, a])
+    for a in range(2):  # half a turn about the vertical
+        positions[4, a] = 2.0 * _spread_kernel(points, a)[0] - position[a]
+        for b in range(3):
+            rotations[4, a, b] = -rotation[a, b]
+    positions[4, 2] = position[2]
+    return 5
 
 
 @kernel
