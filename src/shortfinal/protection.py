@@ -80,7 +80,7 @@ class AlertLimits:
 
     @classmethod
     def lpv200(cls) -> AlertLimits:
-        """As for LPV-200 approaches (ICAO Annex 10, Table 3.7.2.4-1): 40 m horizontally, 35 m vertically."""
+        """As for satellite approaches down to 200 ft (LPV-200): 40 m horizontally, 35 m vertically."""
         return cls(along_m=40.0, cross_m=40.0, vertical_m=35.0)
 
 
@@ -190,9 +190,10 @@ def protection_levels(
     Raises InputError for a risk, rate or prior outside (0, 1), a feature or method that does not
     exist, a `max_faults` that is no positive whole number, an estimate without pose or redundancy.
     """
-    monitor = _monitor(est.dof, integrity_risk, false_alarm_rate, method)
+    _check(integrity_risk, false_alarm_rate, method, max_faults, est.dof)
     if est.pose is None:
         raise InputError(f"est: no pose to protect: the solver ended {est.status.value}")
+    monitor = _monitor(est.dof, integrity_risk, false_alarm_rate, method)
     plan = _plan(_feature_key(est.features), _prior_key(fault_prior), max_faults)
     details, out = _Details(*np.empty((3, 1, len(plan.names), 5))), np.empty((1, 5, 5))
     layout = _layout(len(est.residual), len(est.points), *plan.hypotheses.rows.shape)
@@ -207,15 +208,17 @@ def protection_levels(
         _NO_EDGES if est.edges is None else est.edges[None].copy(),
         _NO_LINES if est.lines is None else est.lines.mean[None].copy(),
     )
-    _protect_kernel(frames, est.camera.intrinsics.copy(), plan.hypotheses, monitor, layout, np.empty(layout[-1]), details, out)
+    _protect_kernel(
+        frames, est.camera.intrinsics.copy(), plan.hypotheses, monitor, layout, np.empty(layout[-1]), details, out
+    )
     levels, first_order, sigma, drivers, passed = out[0].tolist()
     separation = method == METHODS[1]
     return ProtectionLevels(
-        *levels,
+        *PerAxis(*levels),
         first_order=PerAxis(*first_order),
         sigma=PerAxis(*sigma),
-        driver=PerAxis(*[plan.names[int(d)] if d >= 0 else (NO_FAULT, TOO_MANY_FAULTS)[int(-1 - d)] for d in drivers]),
-        reasons=() if max(levels) < math.inf else _reasons(first_order, levels, plan, details.slopes[0]),
+        driver=PerAxis(*[(*plan.names, TOO_MANY_FAULTS, NO_FAULT)[int(d)] for d in drivers]),
+        reasons=() if max(levels) < math.inf else _reasons(levels, first_order, details.slopes[0], plan),
         method=method,
         integrity_risk=integrity_risk,
         false_alarm_rate=false_alarm_rate,
@@ -244,19 +247,20 @@ def protection_levels_batch(
 
     An estimate without a pose has infinite levels. Raises as `protection_levels`.
     """
+    _check(integrity_risk, false_alarm_rate, method, max_faults, batch.dof)
     monitor = _monitor(batch.dof, integrity_risk, false_alarm_rate, method)
     plan = _plan(_feature_key(batch.features), _prior_key(fault_prior), max_faults)
     layout = _layout(batch.residuals.shape[1], batch.mean_px.shape[1], *plan.hypotheses.rows.shape)
     count, intrinsics, out = len(batch), batch.camera.intrinsics.copy(), np.empty((len(batch), 5, 5))
     frames = _Frames(
-        batch.residuals, batch.jacobians, batch.factors.copy(), batch.positions, batch.rotations,
+        batch.residuals, batch.jacobians, batch.factors, batch.positions, batch.rotations,
         batch.points, batch.edges, batch.line_mean,
     )  # fmt: skip
 
     def protect(start: int) -> None:
         part = slice(start, start + CHUNK)
         _protect_kernel(
-            _Frames(*(array[part] if len(array) == count else array for array in frames)),
+            _Frames(*(np.array(array[part] if len(array) == count else array, order="C") for array in frames)),
             intrinsics,
             plan.hypotheses,
             monitor,
@@ -268,8 +272,15 @@ def protection_levels_batch(
 
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         list(pool.map(protect, range(0, count, CHUNK)))
-    passed = batch.converged & (out[:, 4] > 0).all(axis=1) if method == METHODS[1] else None
-    return ProtectionBatch(*out[:, 0].T, out[:, 1], out[:, 2], out[:, 3].astype(np.int64), plan.names, passed)
+    levels, first_order, sigma, drivers, passed = np.swapaxes(out, 0, 1)
+    return ProtectionBatch(
+        **dict(zip(AXES, levels.T, strict=True)),
+        first_order=first_order,
+        sigma=sigma,
+        drivers=drivers.astype(np.int64),
+        hypotheses=plan.names,
+        passed=batch.converged & (passed > 0).all(axis=1) if method == METHODS[1] else None,
+    )
 
 
 class _Frames(NamedTuple):
@@ -320,14 +331,19 @@ class _Plan(NamedTuple):
 _NO_EDGES, _NO_LINES = np.empty((1, 0, 2, 3)), np.empty((1, 0, 2))
 
 
-@lru_cache(maxsize=256)
-def _monitor(dof: int, risk: float, rate: float, method: str) -> _Monitor:
-    check_rate(risk, "integrity_risk")
-    check_rate(rate, "false_alarm_rate")
+def _check(integrity_risk: float, false_alarm_rate: float, method: str, max_faults: int, dof: int) -> None:
+    check_rate(integrity_risk, "integrity_risk")
+    check_rate(false_alarm_rate, "false_alarm_rate")
     if method not in METHODS:
         raise InputError(f"method: {method!r} is unknown; choose {' or '.join(METHODS)}")
+    if isinstance(max_faults, bool) or not isinstance(max_faults, (int, np.integer)) or max_faults < 1:
+        raise InputError(f"max_faults: {max_faults!r} is no number of faults; give a whole number from 1")
     if dof <= 0:
         raise InputError(f"est: no redundancy ({dof} degrees of freedom): no fault can show; add points or sensors")
+
+
+@lru_cache(maxsize=256)
+def _monitor(dof: int, risk: float, rate: float, method: str) -> _Monitor:
     return _Monitor(risk, rate, method == METHODS[1], math.sqrt(chdtri(dof, rate)), _acceptance(dof, rate))
 
 
@@ -336,21 +352,23 @@ def _feature_key(features: tuple[Feature, ...]) -> tuple[tuple[str, int, int], .
 
 
 def _prior_key(fault_prior: float | Mapping[str, float]) -> float | tuple[tuple[str, float], ...]:
-    return tuple(fault_prior.items()) if isinstance(fault_prior, Mapping) else fault_prior
+    if not isinstance(fault_prior, Mapping):
+        check_rate(fault_prior, "fault_prior")
+        return fault_prior
+    for name, value in fault_prior.items():
+        check_rate(value, f"fault_prior: {name}")
+    return tuple(fault_prior.items())
 
 
 @lru_cache(maxsize=256)
 def _plan(
     features: tuple[tuple[str, int, int], ...], prior: float | tuple[tuple[str, float], ...], max_faults: int
 ) -> _Plan:
-    if isinstance(max_faults, bool) or not isinstance(max_faults, int) or max_faults < 1:
-        raise InputError(f"max_faults: {max_faults!r}; give a whole number from 1")
     rows = {name: range(start, stop) for name, start, stop in features}
     priors = dict(prior) if isinstance(prior, tuple) else {name: prior for name in rows if name not in SENSORS}
-    for name, value in priors.items():
+    for name in priors:
         if name not in rows:
             raise InputError(f"fault_prior: {name!r} was not measured; there are {', '.join(rows)}")
-        check_rate(value, f"fault_prior of {name}")
     sets = [s for size in range(1, max_faults + 1) for s in combinations(priors, size)]
     lists = [[row for name in s for row in rows[name]] for s in sets]
     table = np.full((len(sets), max(map(len, lists), default=0)), -1)
@@ -364,23 +382,24 @@ def _plan(
     return _Plan(tuple(" + ".join(s) for s in sets), _Hypotheses(table, products, float(counts[0]), unmonitored))
 
 
-def _reasons(first_order: list[float], levels: list[float], plan: _Plan, slopes: Array) -> tuple[str, ...]:
+def _reasons(levels: list[float], first_order: list[float], slopes: Array, plan: _Plan) -> tuple[str, ...]:
+    """Why levels are infinite, a line for each axis."""
+    spent = f"{plan.hypotheses.unmonitored:.2g} for more faults at once than max_faults"
     reasons = []
-    for axis, first, level, slope in zip(AXES, first_order, levels, slopes.T, strict=True):
+    for axis, level, first, slope in zip(AXES, levels, first_order, slopes.T, strict=True):
+        hidden = np.flatnonzero(np.isinf(slope))
         if first < level == math.inf:
-            reasons.append(f"{axis}: no level: to first order {first:.3g}, too much for a bound to second order")
+            reasons.append(f"{axis}: {first:.3g} to first order is too large a share of the distance for a bound")
+        elif level == math.inf and len(hidden):
+            total, one = plan.hypotheses.priors[hidden].sum(), plan.names[hidden[0]]
+            reasons.append(f"{axis}: the risk does not cover {spent} and {total:.2g} for faults that can hide ({one})")
         elif level == math.inf:
-            hidden = np.flatnonzero(~np.isfinite(slope))
-            spent = f"{plan.hypotheses.unmonitored:.2g} for more faults than max_faults"
-            if len(hidden):
-                total, one = plan.hypotheses.priors[hidden].sum(), plan.names[hidden[0]]
-                spent += f" and {total:.2g} for faults that can hide completely ({one}, ...)"
-            reasons.append(f"{axis}: no level: the integrity risk is less than {spent}")
+            reasons.append(f"{axis}: the risk does not cover {spent}")
     return tuple(reasons)
 
 
 _STEP = 0.03  # of the table below: to the fourth power over 384, the error of its logarithm
-_REACH = 38.0  # P(N(0, 1) > 38) is no number any more
+_REACH = 20.0  # P(N(0, 1) > 20) = 3e-89: too small to count in any risk
 
 
 @lru_cache(maxsize=64)
@@ -475,13 +494,13 @@ class _Scratch(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _layout(n: int, k: int, h: int, m: int) -> NDArray[np.int64]:
-    """Where the arrays of the scratch begin and end in one piece of memory: n rows, K points, h sets of up to m rows."""
+    """Where the arrays of the scratch begin and end in one piece of memory; h sets of up to m rows."""
     sizes = (
-        n * n, n, n - 6, 5 * 3, 5 * 6,
+        n * n, n, n - 6, 5 * 3, 5 * 6, 5 * h,
         6 * n, 6, 6 * 6, (n - 6) * n, n * (n - 6), 5 * n, n, 5 * 6, 5,
         m * (n - 6), m * m, m,
         6 * n, n, k, 3, 3 * 3, 3 * 3, 6,
-        5 * h, h, h,
+        h, h,
     )  # fmt: skip
     return np.cumsum((0, *sizes))
 
@@ -491,18 +510,17 @@ def _scratch_kernel(work, e, n, h, m):  # type: ignore[no-untyped-def]
     """The scratch, cut from `work` at the ends `e`."""
     return _Scratch(
         work[e[0] : e[1]].reshape(n, n), work[e[1] : e[2]], work[e[2] : e[3]], work[e[3] : e[4]].reshape(5, 3),
-        work[e[4] : e[5]].reshape(5, 6),
-        work[e[24] : e[25]].reshape(5, h),
+        work[e[4] : e[5]].reshape(5, 6), work[e[5] : e[6]].reshape(5, h),
         _Linear(
-            work[e[5] : e[6]].reshape(6, n), work[e[6] : e[7]], work[e[7] : e[8]].reshape(6, 6),
-            work[e[8] : e[9]].reshape(n - 6, n), work[e[9] : e[10]].reshape(n, n - 6),
-            work[e[10] : e[11]].reshape(n, 5), work[e[11] : e[12]], work[e[12] : e[13]].reshape(5, 6),
-            work[e[13] : e[14]],
+            work[e[6] : e[7]].reshape(6, n), work[e[7] : e[8]], work[e[8] : e[9]].reshape(6, 6),
+            work[e[9] : e[10]].reshape(n - 6, n), work[e[10] : e[11]].reshape(n, n - 6),
+            work[e[11] : e[12]].reshape(n, 5), work[e[12] : e[13]], work[e[13] : e[14]].reshape(5, 6),
+            work[e[14] : e[15]],
         ),
-        _Shown(work[e[14] : e[15]].reshape(m, n - 6), work[e[15] : e[16]].reshape(m, m), work[e[16] : e[17]]),
+        _Shown(work[e[15] : e[16]].reshape(m, n - 6), work[e[16] : e[17]].reshape(m, m), work[e[17] : e[18]]),
         _Elsewhere(
-            work[e[17] : e[18]].reshape(n, 6), work[e[18] : e[19]], work[e[19] : e[20]], work[e[20] : e[21]],
-            work[e[21] : e[22]].reshape(3, 3), work[e[22] : e[23]].reshape(3, 3), work[e[23] : e[24]],
+            work[e[18] : e[19]].reshape(n, 6), work[e[19] : e[20]], work[e[20] : e[21]], work[e[21] : e[22]],
+            work[e[22] : e[23]].reshape(3, 3), work[e[23] : e[24]].reshape(3, 3), work[e[24] : e[25]],
         ),
         _Worst(work[e[25] : e[26]], work[e[26] : e[27]]),
     )  # fmt: skip
@@ -912,7 +930,8 @@ def _residual_level_kernel(slopes, sigma, hypotheses, monitor, risk, worst, weig
     held in the derivative by x.
     """
     nominal = hypotheses.fault_free * (1.0 - monitor.false_alarm_rate)
-    low, high, x = 0.0, *_guess_kernel(slopes, sigma, hypotheses, monitor, risk, nominal)
+    high, x = _guess_kernel(slopes, sigma, hypotheses, monitor, risk, nominal)
+    low = 0.0
     worst.bias[:] = math.nan
     driver = -1
     for _ in range(200):
@@ -975,10 +994,10 @@ def _step_kernel(total, fall, scale, target):  # type: ignore[no-untyped-def]
 def _worst_kernel(x, k, root, acceptance, worst, s):  # type: ignore[no-untyped-def]
     """max over t of P(|N(k t, 1)| > x) F(t), minus its derivative by x, and that by k; t and dt/dx into row s.
 
-    Both factors are log-concave in t² (Finner & Roters 1997), so that there is one maximum.
+    Both factors are log-concave in t² (Sun, Baricz & Zhou 2010), so that there is one maximum.
     """
     low, high = 0.0, _STEP * (acceptance.shape[0] - 1)
-    if x - k * high > _REACH:  # no number, whatever t
+    if x - k * high > _REACH:  # does not count, whatever t
         return 0.0, 0.0, 0.0
     log_accepted, _, bow = _accept_kernel(0.0, acceptance)
     if k * k * x * x + bow <= 0.0:  # else it pays to show, as density / tail > x
