@@ -1,11 +1,12 @@
 """The pose solver beside OpenCV's and scipy's: time, and accuracy on the same noisy keypoints.
 
-Every solver sees the same problems in turn, in one process, call by call in random order; medians are over problems
-and repeats. Accuracy is the root mean square error along, across and vertical, each over its
-Cramér-Rao bound: 1 is the best any unbiased solver can do. σ is log-normal over the keypoints
-(spread 0.6), as a network's is; OpenCV's solvers know nothing of it. Our call includes the start, the
-covariance and the χ² verdict. The second table shows where the bound ends: far out and with blurred
-keypoints range errors are skewed, and no estimator reaches it.
+Every solver sees the same problems in turn, in one process, call by call in random order; medians
+are over problems and repeats. Accuracy is the root mean square error along, across and vertical,
+each over its Cramér-Rao bound: 1 is the best any unbiased solver can do. σ is log-normal over the
+keypoints (spread 0.6), as a network's is; OpenCV's solvers know nothing of it. Our call includes the
+start, the covariance and the χ² verdict; the second row five protection levels as well. The second
+table shows where the bound ends: far out and with blurred keypoints range errors are skewed, and no
+estimator reaches it.
 
     python benchmarks/solver.py [--problems 1000] [--repeats 5] [--json]
 """
@@ -77,6 +78,13 @@ def ours(problem: Problem) -> Array | None:
     return None if estimate.pose is None else estimate.pose.position_m
 
 
+def ours_with_levels(problem: Problem) -> Array | None:
+    estimate = sf.estimate_pose(problem.keypoints, problem.points, CAMERA)
+    sf.check_integrity(estimate)
+    sf.protection_levels(estimate)
+    return None if estimate.pose is None else estimate.pose.position_m
+
+
 def opencv(flag: int, refine: bool = False) -> Callable[[Problem], Array | None]:
     """OpenCV's solver `flag`; of two poses the first that is above the ground and upright."""
 
@@ -119,6 +127,7 @@ def scipy_whitened(problem: Problem) -> Array | None:
 OURS, BARE, SCIPY = "shortfinal, one call with verdict", "OpenCV SQPNP, the bare call", "scipy least_squares, whitened"
 SOLVERS: dict[str, Callable[[Problem], Array | None]] = {
     OURS: ours,
+    "shortfinal, with protection levels": ours_with_levels,
     BARE: sqpnp_alone,
     "OpenCV SQPNP": opencv(cv2.SOLVEPNP_SQPNP),
     "OpenCV IPPE": opencv(cv2.SOLVEPNP_IPPE),
