@@ -813,7 +813,8 @@ def _second_level_kernel(frame, intrinsics, rows, w, a, slopes, level, sigma):  
         and _project_kernel(elsewhere.jacobian, w.gradients, w.unit, a, a + 1, w.linear)
     ):
         return math.inf
-    # The truth may lie on the other side: to this order the change there is the opposite.
+    # The truth may lie on the other side: to this order the change there is the opposite. Where the
+    # worst error is beyond the level in the mean, a wider one exceeds it less; that is not relied on.
     bent, rest = 0.0, level
     for s in range(rows.shape[0]):
         if w.weights[a, s] > 0.0:
@@ -821,7 +822,7 @@ def _second_level_kernel(frame, intrinsics, rows, w, a, slopes, level, sigma):  
             slope = _slope_kernel(rows[s], a, w.size, w.linear, w.shown)
             bent += w.weights[a, s] * (slopes[s] + abs(slope - slopes[s]))
             rest -= w.weights[a, s] * slopes[s]
-    bent += rest * (1.0 + abs(w.linear.sigma[a] / sigma - 1.0))
+    bent += rest + max(rest, 0.0) * abs(w.linear.sigma[a] / sigma - 1.0)
     return level * level / (2.0 * level - bent) if bent < 2.0 * level else math.inf
 
 
