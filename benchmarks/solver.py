@@ -1,7 +1,8 @@
 """The pose solver beside OpenCV's and scipy's: time, and accuracy on the same noisy keypoints.
 
-Every solver sees the same problems in turn, in one process, call by call in random order; medians
-are over problems and repeats. Accuracy is the root mean square error along, across and vertical,
+Every solver sees the same problems in one process, interleaved with the others in random order: in
+turns of 50 problems, and again call by call, where each finds the caches as the others left them.
+Medians are over problems and repeats. Accuracy is the root mean square error along, across and vertical,
 each over its Cramér-Rao bound: 1 is the best any unbiased solver can do. σ is log-normal over the
 keypoints (spread 0.6), as a network's is; OpenCV's solvers know nothing of it. Our call includes the
 start, the covariance and the χ² verdict; the second row five protection levels as well. The second
@@ -134,51 +135,62 @@ SOLVERS: dict[str, Callable[[Problem], Array | None]] = {
     "OpenCV IPPE + refineLM": opencv(cv2.SOLVEPNP_IPPE, refine=True),
     "OpenCV ITERATIVE": opencv(cv2.SOLVEPNP_ITERATIVE),
 }
-COLD = ", right after scipy"
+TURNS = {"microseconds": 50, "microseconds_cold": 1}  # problems that a solver has before the next has its turn
 
 
 def measure(count: int, repeats: int) -> list[dict[str, Any]]:
-    """Median time and accuracy of every solver.
+    """Median time and accuracy of every solver, in turns and call by call.
 
-    scipy has turns of its own: it takes a hundred times as long, and leaves cold caches to whoever
-    comes next, as a network's inference would. Two rows show what that costs.
+    scipy has its turns apart: it takes a hundred times as long, and would leave cold caches to
+    whoever comes next in either case.
     """
     cases, order = problems(count), np.random.default_rng(1)
-    names = [*SOLVERS, SCIPY, OURS + COLD, BARE + COLD]
-    times: dict[str, list[float]] = {name: [] for name in names}
-    found: dict[str, dict[int, Array | None]] = {name: {} for name in names}
-
-    def timed(name: str, solve: Callable[[Problem], Array | None], problem: Problem) -> None:
-        begin = time.perf_counter()
-        position = solve(problem)
-        times[name].append(time.perf_counter() - begin)
-        found[name].setdefault(id(problem), position)
-
     for solve in (*SOLVERS.values(), scipy_whitened):
         solve(cases[0])  # compilation and first-use costs are not the solver's
-    for _ in range(repeats):
-        for problem in cases:
-            for name in order.permutation(list(SOLVERS)):
-                timed(name, SOLVERS[name], problem)
-    for problem in cases:
-        for name in (OURS, BARE):
-            timed(SCIPY, scipy_whitened, problem)
-            timed(name + COLD, SOLVERS[name], problem)
-    rows = [_row(name, float(np.median(times[name])), cases, list(found[name].values())) for name in names]
-    rows += [_batch(cases, threads, max(repeats, 5)) for threads in dict.fromkeys((1, os.cpu_count() or 1))]
-    for row in rows:
-        row["times_ours"] = row["microseconds"] / rows[0]["microseconds"]
-    return rows
+    rows: dict[str, dict[str, Any]] = {}
+    for column, turn in TURNS.items():
+        for name, (seconds, found) in _interleaved(SOLVERS, cases, turn, repeats, order).items():
+            row = rows.setdefault(name, {"solver": name} | _accuracy(name, cases, found))
+            row[column] = 1e6 * seconds
+    seconds, found = _interleaved({SCIPY: scipy_whitened}, cases, count, 1, order)[SCIPY]
+    rows[SCIPY] = {"solver": SCIPY, "microseconds": 1e6 * seconds} | _accuracy(SCIPY, cases, found)
+    batches = [_batch(cases, threads, max(repeats, 5)) for threads in dict.fromkeys((1, os.cpu_count() or 1))]
+    table = [*rows.values(), *batches]
+    for row in table:
+        row["times_ours"] = row["microseconds"] / rows[OURS]["microseconds"]
+    return table
 
 
-def _row(name: str, seconds: float, cases: list[Problem], found: list[Array | None]) -> dict[str, Any]:
-    row: dict[str, Any] = {"solver": name, "microseconds": 1e6 * seconds}
-    if name.startswith(BARE):
-        return row
+def _interleaved(
+    solvers: dict[str, Callable[[Problem], Array | None]],
+    cases: list[Problem],
+    turn: int,
+    repeats: int,
+    order: np.random.Generator,
+) -> dict[str, tuple[float, list[Array | None]]]:
+    """Median seconds of each solver, and the positions that it found."""
+    times: dict[str, list[float]] = {name: [] for name in solvers}
+    found: dict[str, list[Array | None]] = {name: [] for name in solvers}
+    for repeat in range(repeats):
+        for start in range(0, len(cases), turn):
+            for name in order.permutation(list(solvers)):
+                for problem in cases[start : start + turn]:
+                    begin = time.perf_counter()
+                    position = solvers[name](problem)
+                    times[name].append(time.perf_counter() - begin)
+                    if repeat == 0:
+                        found[name].append(position)
+    return {name: (float(np.median(times[name])), found[name]) for name in solvers}
+
+
+def _accuracy(name: str, cases: list[Problem], found: list[Array | None]) -> dict[str, Any]:
+    """RMS error over the bound for each axis, and how many problems were not solved."""
+    if name == BARE:
+        return {}
     solved = [(p, x) for p, x in zip(cases, found, strict=True) if x is not None and np.isfinite(x).all()]
     errors = np.array([(x - p.truth.position_m) / p.bound for p, x in solved])
     rms = np.sqrt(np.mean(errors**2, axis=0))
-    return row | dict(zip(AXES, rms.tolist(), strict=True)) | {"unsolved": len(cases) - len(solved)}
+    return dict(zip(AXES, rms.tolist(), strict=True)) | {"unsolved": len(cases) - len(solved)}
 
 
 def _batch(cases: list[Problem], threads: int, repeats: int) -> dict[str, Any]:
@@ -199,7 +211,8 @@ def _batch(cases: list[Problem], threads: int, repeats: int) -> dict[str, Any]:
         check_integrity_batch(batch)
         seconds.append((time.perf_counter() - begin) / len(mean))
     found = [x if np.isfinite(x).all() else None for x in batch.positions[: len(cases)]]
-    return _row(f"shortfinal, batch, {threads} threads", float(np.median(seconds)), cases, found)
+    name = f"shortfinal, batch, {threads} thread{'s' if threads > 1 else ''}"
+    return {"solver": name, "microseconds": 1e6 * float(np.median(seconds))} | _accuracy(name, cases, found)
 
 
 def reach(count: int) -> list[dict[str, Any]]:
@@ -222,13 +235,14 @@ def _reach(distance_m: float, sigma_px: float, count: int) -> dict[str, Any]:
 
 
 def _print(rows: list[dict[str, Any]], reached: list[dict[str, Any]]) -> None:
-    table = Table("solver", "µs", "times ours", *(f"{axis} / bound" for axis in AXES), "unsolved")
+    table = Table("solver", "µs", "times ours", "µs, cold", *(f"{axis} / bound" for axis in AXES), "unsolved")
     for row in rows:
         figures = [f"{row[axis]:.3f}" if axis in row else "" for axis in AXES]
         table.add_row(
             row["solver"],
             f"{row['microseconds']:.1f}",
             f"{row['times_ours']:.2f}",
+            f"{row['microseconds_cold']:.1f}" if "microseconds_cold" in row else "",
             *figures,
             str(row.get("unsolved", "")),
         )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -30,6 +31,7 @@ class Feature(NamedTuple):
     rows: slice
 
 
+@lru_cache(maxsize=64)
 def feature_rows(keypoints: int, lines: int, attitude: bool, position: bool, altitude: bool) -> tuple[Feature, ...]:
     """The features in the order of the solver's rows: corners by name, further points by number."""
     named = [*CORNER_NAMES, *(f"point {k}" for k in range(len(CORNER_NAMES), keypoints))][:keypoints]

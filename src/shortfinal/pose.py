@@ -132,7 +132,9 @@ class PoseEstimate:
     @cached_property
     def factor(self) -> Array:
         """L (n, n), the Cholesky factor of the covariance of all rows: whitening divides by it."""
-        return frozen(np.linalg.cholesky(_block_diagonal([cov[None] for cov in self._covariances()])[0]))
+        covs = list(self._covariances())
+        whole = covs[0] if len(covs) == 1 else _block_diagonal([cov[None] for cov in covs])[0]
+        return frozen(np.linalg.cholesky(whole))
 
     @property
     def sigma_position_m(self) -> Array | None:
