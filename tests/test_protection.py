@@ -18,6 +18,7 @@ from shortfinal.integrity import check_integrity_batch
 from shortfinal.pose import STATUS_OF_CODE, estimate_pose_batch
 from shortfinal.protection import (
     _STEP,
+    LARGEST_GROWTH,
     METHODS,
     NO_FAULT,
     SENSORS,
@@ -413,6 +414,21 @@ def test_without_redundancy_in_effect_the_level_is_out_of_bounds():
     assert pl.along_m == math.inf
     assert pl.first_order.along_m > 1e4
     assert "too large a share of the distance" in pl.reasons[0]
+
+
+def test_far_out_there_is_no_level():
+    # The level grows against its first order until two orders are not enough; then it is infinite.
+    growth = []
+    for distance in (1000.0, 2000.0, 4000.0, 8000.0, 12_000.0):
+        pl = protection_levels(estimate(17, distance=distance, sigma=0.7, noise=0.0))
+        growth.append(np.array(pl.levels) / pl.first_order)
+        assert (growth[-1][np.isfinite(growth[-1])] < LARGEST_GROWTH).all()
+        assert len(pl.reasons) == np.isinf(pl.levels).sum()
+    growth = np.array(growth)[:, :3]
+    assert np.isfinite(growth[:2]).all()
+    assert np.isinf(growth[-1]).all()
+    rising = growth[:-1] < growth[1:]
+    assert (rising | np.isinf(growth[:-1])).all()
 
 
 def test_no_fault_prior_leaves_the_normal_error():

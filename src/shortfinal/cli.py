@@ -78,7 +78,7 @@ def demo(out: Out = Path("results/demo"), model: Model = None, as_json: Json = F
         _print_json(_demo_summary(flown) | {"out": str(out)})
         return
     rows: list[Flown] = []
-    _compile(scenes=True)
+    _compile(levels=True, scenes=True)
     with Live(console=console, refresh_per_second=4, vertical_overflow="crop") as live:
 
         def seen(frame: Flown) -> None:
@@ -116,7 +116,7 @@ def run(
         runway=given, database=runways,
     )  # fmt: skip
     if not as_json:
-        _compile(scenes=False)
+        _compile(levels=True)
     evaluation, results = _run_folder(folder, out, model, false_alarm_rate, quiet=as_json)
     if as_json:
         _print_json(asdict(evaluation) | {"out": str(out)})
@@ -142,7 +142,7 @@ def audit(
 
     given = read_camera(camera) if camera else None
     if not as_json:
-        _compile(scenes=False)
+        _compile()
     report = audit_file(labels, runways, out, sigma_px=sigma_px, false_alarm_rate=false_alarm_rate, camera=given)
     if as_json:
         _print_json(report_as_dict(report))
@@ -306,23 +306,12 @@ def _run_folder(
     return evaluation, results
 
 
-def _compile(*, scenes: bool) -> None:
-    """Compile the kernels, which takes half a minute the first time, with something to look at."""
-    import numpy as np
+def _compile(*, levels: bool = False, scenes: bool = False) -> None:
+    """Compile the kernels with something to look at."""
+    from shortfinal.warm import warm_up
 
-    from shortfinal.geometry import Camera, Pose, project
-    from shortfinal.keypoints import GaussianKeypoints
-    from shortfinal.pose import estimate_pose
-    from shortfinal.runway import Runway
-
-    with console.status("compiling the kernels (once on this machine, about half a minute) ..."):
-        camera, runway, pose = Camera(8, 8, 10, 10, 3.5, 3.5), Runway(1500, 45), Pose.from_attitude([-900, 0, 60])
-        corners = project(camera, pose, runway.corners)
-        estimate_pose(GaussianKeypoints.from_sigma(corners, 1.0), runway.corners, camera)
-        if scenes:
-            from shortfinal.data.scene import random_scene, render
-
-            render(random_scene(np.random.default_rng(0), runway), camera, pose)
+    with console.status("compiling the kernels (once on this machine, most of a minute) ..."):
+        warm_up(levels=levels, scenes=scenes)
 
 
 def _sized_runway(size: str, ident: str) -> Any:
@@ -386,9 +375,9 @@ def _table(title: str, columns: tuple[str, ...]) -> Table:
 
 
 def _demo_table(frames: Iterable[Flown]) -> Table:
-    table = _table("", ("frame", "distance", "height", "error", "up", "level", "σ px", "p", "verdict", "fault"))
+    table = _table("", ("frame", "distance", "height", "error", "up", "level", "p", "verdict", "fault"))
     for f in frames:
-        estimate, keypoints = f.result.estimate, f.result.keypoints
+        estimate = f.result.estimate
         cells = ["–"] * 4
         sigma_m = None if estimate is None else estimate.sigma_position_m
         if estimate is not None and estimate.pose is not None and sigma_m is not None and f.error_m is not None:
@@ -397,10 +386,9 @@ def _demo_table(frames: Iterable[Flown]) -> Table:
             along, _, vertical = f.error_m
             cells = [f"{-x:.0f} ±{sx:.0f}", f"{z:.0f} ±{sz:.1f}", f"{along:+.1f}", f"{vertical:+.1f}"]
         level = "–" if f.result.protection is None else f"{f.result.protection.vertical_m:.0f}"
-        sigma = "–" if keypoints is None else f"{keypoints.sigma_px.mean():.2f}"
         p, decision = f.result.verdict.p_value, f.result.verdict.decision.value
         table.add_row(
-            str(f.number), *cells, level, sigma, "–" if p is None else f"{p:.0e}",
+            str(f.number), *cells, level, "–" if p is None else f"{p:.0e}",
             Text(decision, style=_STYLES[decision]), Text(_FAULT_WORDS[f.fault.name], style="yellow"),
         )  # fmt: skip
     return table

@@ -44,6 +44,7 @@ FAULT_PRIOR = 1e-4
 METHODS = ("residual", "solution-separation")
 GLIDE_PATH_ORIGIN_M = 300.0  # past the threshold: where an ILS glide path meets the runway
 SENSORS = ("attitude prior", "position prior", "altitude")  # faulty only where a mapping says so
+LARGEST_GROWTH = 1.5  # of a level from first to second order; beyond, two orders are not enough
 NO_FAULT, TOO_MANY_FAULTS = "no fault", "more faults than max_faults"
 
 
@@ -186,6 +187,10 @@ def protection_levels(
     "residual" (default) is the exact worst case of the χ² test, and holds for frames that
     `check_integrity` accepts at `false_alarm_rate`. "solution-separation" holds for frames whose
     `passed` is true; `false_alarm_rate` is then that of the test of one axis.
+
+    Levels are of second order in the errors; where that makes them half again as large as to first
+    order, or larger, the series is not trusted and they are infinite. They bound what the stated
+    covariance, priors and independence imply, and nothing else.
 
     Raises InputError for a risk, rate or prior outside (0, 1), a feature or method that does not
     exist, a `max_faults` that is no positive whole number, an estimate without pose or redundancy.
@@ -389,7 +394,7 @@ def _reasons(levels: list[float], first_order: list[float], slopes: Array, plan:
     for axis, level, first, slope in zip(AXES, levels, first_order, slopes.T, strict=True):
         hidden = np.flatnonzero(np.isinf(slope))
         if first < level == math.inf:
-            reasons.append(f"{axis}: {first:.3g} to first order is too large a share of the distance for a bound")
+            reasons.append(f"{axis}: {first:.3g} to first order, too large a share of the distance to be a bound")
         elif level == math.inf and len(hidden):
             total, one = plan.hypotheses.priors[hidden].sum(), plan.names[hidden[0]]
             reasons.append(f"{axis}: the risk does not cover {spent} and {total:.2g} for faults that can hide ({one})")
@@ -823,7 +828,8 @@ def _second_level_kernel(frame, intrinsics, rows, w, a, slopes, level, sigma):  
             bent += w.weights[a, s] * (slopes[s] + abs(slope - slopes[s]))
             rest -= w.weights[a, s] * slopes[s]
     bent += rest + max(rest, 0.0) * abs(w.linear.sigma[a] / sigma - 1.0)
-    return level * level / (2.0 * level - bent) if bent < 2.0 * level else math.inf
+    growth = 1.0 / (2.0 - bent / level) if bent < 2.0 * level else math.inf
+    return level * growth if growth < LARGEST_GROWTH else math.inf
 
 
 @kernel
