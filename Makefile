@@ -19,10 +19,8 @@ check: .venv/dev            ## formatting, lint, types
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-bench: .venv/dev            ## the solver against its peers, the 184 m fault, the renderer
-	$(BIN)/python benchmarks/solver.py
-	$(BIN)/python benchmarks/threshold_fault.py
-	$(BIN)/python benchmarks/render.py
+bench: .venv/dev            ## the solver against its peers, faults, windows, distributions, campaigns, the renderer
+	for name in solver threshold_fault window distribution campaigns render; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 clean:
 	rm -rf .venv results .pytest_cache .ruff_cache .mypy_cache .hypothesis

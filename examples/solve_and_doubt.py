@@ -26,6 +26,9 @@ def report(title: str, corners_px: np.ndarray) -> sf.IntegrityVerdict:
     print(title)
     print(f"  {-x:.0f} ± {sx:.0f} m before the threshold, {y:+.1f} ± {sy:.1f} m left, {z:.1f} ± {sz:.1f} m high (2σ)")
     print(f"  {verdict.decision.name}: {verdict.reasons[0]}")
+    levels = sf.protection_levels(estimate, integrity_risk=1e-5, fault_prior=1e-4)
+    for reason in levels.available(sf.AlertLimits.lpv200()).reasons:
+        print(f"  not available, {reason}")
     return verdict
 
 

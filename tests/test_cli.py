@@ -91,6 +91,8 @@ def test_solve(tmp_path, capsys):
     record = json.loads(out)
     assert record["position_m"] == pytest.approx(approach_pose(60).position_m, abs=1e-5)
     assert record["decision"] == "use"
+    assert record["excluded"] == []
+    assert record["levels"]["vertical_m"] > 2 * record["cov"][2][2] ** 0.5
     assert call(capsys, "solve", problem_file(tmp_path))[0] == 0
 
 

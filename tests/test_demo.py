@@ -33,12 +33,13 @@ def test_frames_without_a_fault_are_used_and_their_errors_lie_in_their_bounds(fl
     assert len(used) >= len(sound) - 3
     ratios = np.array([f.error_m / np.sqrt(np.diag(f.result.estimate.cov)[:3]) for f in used])
     assert np.mean(np.abs(ratios) < 2) > 0.75
+    assert all((np.abs(f.error_m) < f.result.protection.levels[:3]).all() for f in used)
 
 
 @pytest.mark.slow
 def test_the_short_far_threshold_moves_the_pose_and_mostly_passes(flight):
     # What a single frame cannot show: the camera is put nearer and lower by this fault (on the axis, at
-    # 2 km from 1,500 m: 18 m and 9 m, docs/integrity.md), and few frames are refused.
+    # 2 km from 1,500 m: 18 m and 9 m, docs/limits.md), and few frames are refused.
     short = of(flight[1], Fault.FAR_THRESHOLD)
     moved = np.median([f.moved_m for f in short], axis=0)
     assert 5 < moved[0] < 80

@@ -31,6 +31,11 @@ def test_one_frame_in_keypoints_pose_and_verdict_out(pipeline, frame):
     error = result.estimate.pose.minus(TRUTH)
     assert error @ np.linalg.inv(result.estimate.cov) @ error < 22.5  # χ²(6) at 0.1 %
     assert set(result.timings) == {"detect_ms", "solve_ms", "doubt_ms"}
+    # A level at 1e-7 lies beyond 5.3 sigma (the normal quantile), and that is what is recorded.
+    assert (np.array(result.protection.levels[:3]) > 5.3 * result.estimate.sigma_position_m).all()
+    recorded = result.to_dict()["protection"]
+    assert recorded["along_m"] == result.protection.along_m
+    assert (recorded["vertical_m"] is None) == np.isinf(result.protection.vertical_m)  # JSON knows no infinity
 
 
 def test_a_prior_pose_is_as_good_as_a_box(pipeline, frame):

@@ -183,9 +183,12 @@ def solve(
     sigma = estimate.sigma_position_m
     assert sigma is not None
     for axis, (name, value, s) in enumerate(zip("xyz", estimate.pose.position_m, sigma, strict=True)):
-        level = "" if record["levels"] is None else f", level {levels.levels[axis]:.3g} m"
+        bounded = record["levels"] is not None and levels.levels[axis] < float("inf")
+        level = f", protection level {levels.levels[axis]:.3g} m" if bounded else ""
         console.print(f"{name}  {value:12.3f} ± {2 * s:.3f} m (2σ){level}")
     console.print("yaw {:.3f}, pitch {:.3f}, roll {:.3f} degrees".format(*estimate.pose.attitude))
+    for reason in levels.reasons if record["levels"] is not None else ():
+        console.print(reason)
     console.print(f"{verdict.decision.value}: {'; '.join(verdict.reasons)}", style=_STYLES[verdict.decision.value])
 
 
@@ -385,7 +388,10 @@ def _demo_table(frames: Iterable[Flown]) -> Table:
             sx, _, sz = 2 * sigma_m
             along, _, vertical = f.error_m
             cells = [f"{-x:.0f} ±{sx:.0f}", f"{z:.0f} ±{sz:.1f}", f"{along:+.1f}", f"{vertical:+.1f}"]
-        level = "–" if f.result.protection is None else f"{f.result.protection.vertical_m:.0f}"
+        protection = f.result.protection
+        level = (
+            "none" if protection is None or protection.vertical_m == float("inf") else f"{protection.vertical_m:.0f}"
+        )
         p, decision = f.result.verdict.p_value, f.result.verdict.decision.value
         table.add_row(
             str(f.number), *cells, level, "–" if p is None else f"{p:.0e}",
@@ -437,7 +443,7 @@ def _print_demo_summary(flown: list[Flown], out: Path) -> None:
     console.print(table)
     console.print(
         "Medians of all frames, in metres; moved: what the fault did to the pose. The slid corner must be refused. "
-        "The misplaced far threshold fits another pose so well that one frame often cannot show it (docs/integrity.md)."
+        "The misplaced far threshold fits another pose so well that one frame often cannot show it (docs/limits.md)."
     )
     console.print(f"written: {out}/approach.mp4, contact_sheet.png, timeline.png, frames.jsonl")
 

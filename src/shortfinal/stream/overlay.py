@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -167,7 +168,7 @@ def _figures(result: FrameResult, notes: Notes) -> list[tuple[str, str, str]]:
             lines.append((name, value, error))
     if result.protection is not None:
         levels = result.protection
-        each = " / ".join(f"{level:.0f}" for level in (levels.along_m, levels.cross_m, levels.vertical_m))
+        each = " / ".join("none" if level == math.inf else f"{level:.0f}" for level in levels.levels[:3])
         lines.append(("level", f"{each} m", f"risk {levels.integrity_risk:.0e}"))
     if result.keypoints is not None:
         sigma_px = result.keypoints.sigma_px
