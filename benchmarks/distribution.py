@@ -16,7 +16,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 
@@ -127,10 +127,10 @@ def _held(case: tuple[int, tuple[sf.Pose, sf.PoseEstimate]], method: str, sample
 
 
 def coverage(zone: str, design: str, method: str, problems: int, samples: int = 1000, seed: int = 0) -> Row:
-    """Count over `problems` frames, on all processors."""
+    """Count over `problems` frames, on all processors: the kernels leave the interpreter to others."""
     cases = list(enumerate(frames(ZONES[zone], design, problems, seed)))
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
-        answers = list(pool.map(partial(_held, method=method, samples=samples), cases, chunksize=8))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        answers = list(pool.map(partial(_held, method=method, samples=samples), cases))
     held = [answer for answer, _ in answers if answer is not None]
     counts = np.sum(held, axis=0).astype(int) if held else np.zeros((len(LEVELS), 3), int)
     covered = {axis: counts[:, a].tolist() for a, axis in enumerate(AXES)}

@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -404,7 +405,8 @@ def main() -> None:
     options = parser.parse_args()
     inflated = [(rho, (1 + rho) / (1 - rho)) for rho in (0.5, 0.9)]
     jobs = [(rho, 1.0, options.windows) for rho in (0.0, 0.5, 0.9)] + [(*pair, options.windows) for pair in inflated]
-    with ProcessPoolExecutor(options.jobs) as pool:
+    # Fresh processes: a fork of one with threads, as numpy's, may wait forever.
+    with ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool:
         rows = [row for part in pool.map(_summary, [(s, options.flights) for s in settings()]) for row in part]
         correlations = list(pool.map(_correlated, jobs))
     content = write(rows, correlations, options.out)

@@ -23,7 +23,7 @@ PATH = Path(__file__).parents[1] / "benchmarks" / "distribution.py"
 def benchmark():
     spec = importlib.util.spec_from_file_location("distribution_benchmark", PATH)
     module = importlib.util.module_from_spec(spec)
-    sys.modules["distribution_benchmark"] = module  # dataclasses and worker processes look their module up
+    sys.modules["distribution_benchmark"] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     yield module
     del sys.modules["distribution_benchmark"]
