@@ -379,10 +379,10 @@ def test_a_rotation_object_will_do():
         ([1, 2, np.nan], np.eye(3), np.eye(6), "motion: position_m: entry"),
         ([1, 2, 3], 2 * np.eye(3), np.eye(6), "motion: runway_from_camera: not a rotation"),
         ([1, 2, 3], np.eye(3), np.eye(5), "motion: cov: expected shape"),
-        ([1, 2, 3], np.eye(3), np.zeros((6, 6)), "motion: cov must be symmetric and positive definite"),
-        ([1, 2, 3], np.eye(3), np.diag([1, 1, 1, 1, 1, -1.0]), "motion: cov must be symmetric and positive definite"),
-        ([1, 2, 3], np.eye(3), np.ones((6, 6)), "motion: cov must be symmetric and positive definite"),
-        ([1, 2, 3], np.eye(3), np.eye(6) + np.eye(6, k=1) / 2, "motion: cov must be symmetric and positive definite"),
+        ([1, 2, 3], np.eye(3), np.zeros((6, 6)), "motion: cov: the variance of x is 0"),
+        ([1, 2, 3], np.eye(3), np.diag([1, 1, 1, 1, 1, -1.0]), "motion: cov: the variance of the turn about z is -1"),
+        ([1, 2, 3], np.eye(3), np.ones((6, 6)), "motion: cov: not positive definite"),
+        ([1, 2, 3], np.eye(3), np.eye(6) + np.eye(6, k=1) / 2, "motion: cov: not symmetric"),
     ],
 )
 def test_bad_motions_are_refused(translation, turn, cov, message):
@@ -426,13 +426,13 @@ def test_what_cannot_be_checked_is_not_monitored():
     poses = flight(rng, 3000, 3)
     estimates, motions = frames(rng, poses), odometry(rng, poses)
     exact = odometry(rng, poses, 1e-16 * STEP_COV)
-    vague = frames(rng, poses, 60.0, noise=np.zeros((3, 8)))
+    vague = frames(rng, poses, 18.0, noise=np.zeros((3, 8)))
     blank = [replace(e, sharp_rows=0) for e in estimates]
     for given, moved, reason in (
         ([], [], "two frames"),
         (estimates[:1], [], "two frames"),
         (estimates, exact, "no well-determined optimum"),
-        (vague, motions, "uncertain by more than 50% of its distance"),
+        (vague, [None, None], "uncertain by more than 50% of its distance"),
         (blank, motions, "no redundancy in effect"),
         ([estimates[0], unsolved(poses[1]), estimates[2]], motions, "frame 1: .* ended ill-conditioned"),
     ):

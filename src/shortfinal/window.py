@@ -28,10 +28,12 @@ from scipy.special import chdtrc, chdtri
 from shortfinal.errors import InputError
 from shortfinal.geometry import Pose, as_array, kernel, project_kernel, so3_exp
 from shortfinal.integrity import FALSE_ALARM_RATE, LARGEST_SHARE, Decision, check_integrity, check_rate
+from shortfinal.keypoints import check_covariance
 from shortfinal.pose import AMBIGUITY_CHI2, PoseEstimate, SolverStatus
 
 Array = NDArray[np.float64]
 
+_MOTION_AXES = ("x", "y", "z", "the turn about x", "the turn about y", "the turn about z")
 _MAX_ITERATIONS = 30
 _STEP_TOLERANCE = 1e-6  # δᵀJᵀJδ: what a further step could change of the statistic
 _UNSEEN = 1e-12  # share of a suspect's effect that no pose explains, below which it is rounding
@@ -61,10 +63,7 @@ class RelativeMotion:
         except InputError as error:
             raise InputError(f"motion: {error}") from error
         cov = as_array(self.cov, (6, 6), "motion: cov")
-        sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
-        correlation = cov / np.outer(sigma, sigma) if sigma.all() else cov
-        if not (sigma.all() and np.abs(correlation - correlation.T).max() < 1e-8 and _smallest(correlation) > 1e-10):
-            raise InputError("motion: cov must be symmetric and positive definite; a motion known exactly has none")
+        check_covariance(cov, "motion: cov", lambda row: _MOTION_AXES[row])
         object.__setattr__(self, "translation_m", step.position_m)
         object.__setattr__(self, "earlier_from_later", step.runway_from_camera)
         object.__setattr__(self, "cov", cov)
@@ -584,10 +583,6 @@ def _cross(v: Array) -> Array:
 
 def _symmetric(cov: Array) -> Array:
     return 0.5 * (cov + cov.T)
-
-
-def _smallest(symmetric: Array) -> float:
-    return float(np.linalg.eigvalsh(symmetric)[0])
 
 
 @kernel
