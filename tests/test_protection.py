@@ -374,7 +374,8 @@ def test_a_fault_that_can_hide_is_charged_or_makes_the_level_infinite():
     assert pl.levels == (math.inf,) * 5
     assert pl.first_order == (math.inf,) * 5
     assert len(pl.reasons) == 5
-    assert "6e-06 for faults that can hide" in pl.reasons[0]
+    assert "4e-09 for more faults at once" in pl.reasons[0]
+    assert "can hide (near-left + near-right" in pl.reasons[0]
     assert pl.driver.along_m == "near-left + near-right"
     # With risk enough they are charged, and the rest goes to the single faults.
     risk = 1e-5

@@ -22,7 +22,7 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import combinations
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -111,7 +111,6 @@ class ProtectionLevels:
     first_order: PerAxis[float]  # the levels with the slopes at the estimate alone
     sigma: PerAxis[float]  # standard deviation without a fault, first-order
     driver: PerAxis[str]  # the hypothesis that contributes most
-    reasons: tuple[str, ...]  # why a level is infinite; empty when none is
     method: str
     integrity_risk: float
     false_alarm_rate: float
@@ -123,6 +122,22 @@ class ProtectionLevels:
     separations: Array | None  # (h, 5) the estimate less that without the features, metres and degrees
     thresholds: Array | None  # (h, 5) how much of it solution separation tolerates
     passed: bool | None  # solution separation's own monitor; None with "residual", whose is check_integrity
+
+    @cached_property
+    def reasons(self) -> tuple[str, ...]:
+        """Why levels are infinite, a line for each axis; empty when none is."""
+        spent = f"{self.unmonitored:.2g} for more faults at once than max_faults"
+        reasons = []
+        for axis, level, first, slope in zip(AXES, self.levels, self.first_order, self.slopes.T, strict=True):
+            hidden = np.flatnonzero(np.isinf(slope))
+            if first < level == math.inf:
+                reasons.append(f"{axis}: {first:.3g} to first order, too large a share of the distance to be a bound")
+            elif level == math.inf and len(hidden):
+                names = ", ".join(self.hypotheses[i] for i in hidden[:3])
+                reasons.append(f"{axis}: the risk does not cover {spent} and faults that can hide ({names})")
+            elif level == math.inf:
+                reasons.append(f"{axis}: the risk does not cover {spent}")
+        return tuple(reasons)
 
     @property
     def levels(self) -> PerAxis[float]:
@@ -223,7 +238,6 @@ def protection_levels(
         first_order=PerAxis(*first_order),
         sigma=PerAxis(*sigma),
         driver=PerAxis(*[(*plan.names, TOO_MANY_FAULTS, NO_FAULT)[int(d)] for d in drivers]),
-        reasons=() if max(levels) < math.inf else _reasons(levels, first_order, details.slopes[0], plan),
         method=method,
         integrity_risk=integrity_risk,
         false_alarm_rate=false_alarm_rate,
@@ -385,22 +399,6 @@ def _plan(
     products = np.array([math.prod(priors[name] for name in s) for s in sets])
     unmonitored = float(counts[max_faults + 1 :].sum())
     return _Plan(tuple(" + ".join(s) for s in sets), _Hypotheses(table, products, float(counts[0]), unmonitored))
-
-
-def _reasons(levels: list[float], first_order: list[float], slopes: Array, plan: _Plan) -> tuple[str, ...]:
-    """Why levels are infinite, a line for each axis."""
-    spent = f"{plan.hypotheses.unmonitored:.2g} for more faults at once than max_faults"
-    reasons = []
-    for axis, level, first, slope in zip(AXES, levels, first_order, slopes.T, strict=True):
-        hidden = np.flatnonzero(np.isinf(slope))
-        if first < level == math.inf:
-            reasons.append(f"{axis}: {first:.3g} to first order, too large a share of the distance to be a bound")
-        elif level == math.inf and len(hidden):
-            total, one = plan.hypotheses.priors[hidden].sum(), plan.names[hidden[0]]
-            reasons.append(f"{axis}: the risk does not cover {spent} and {total:.2g} for faults that can hide ({one})")
-        elif level == math.inf:
-            reasons.append(f"{axis}: the risk does not cover {spent}")
-    return tuple(reasons)
 
 
 _STEP = 0.03  # of the table below: to the fourth power over 384, the error of its logarithm
