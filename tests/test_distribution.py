@@ -1,8 +1,6 @@
 """Draws of a pose follow the law they claim, and where that law ends is on record."""
 
-import importlib.util
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,17 +14,7 @@ from shortfinal.distribution import METHODS, pose_costs, sample_pose
 from shortfinal.geometry import project_lines
 from shortfinal.pose import estimate_pose_batch
 
-PATH = Path(__file__).parents[1] / "benchmarks" / "distribution.py"
-
-
-@pytest.fixture(scope="module")
-def benchmark():
-    spec = importlib.util.spec_from_file_location("distribution_benchmark", PATH)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["distribution_benchmark"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["distribution_benchmark"]
+BENCHMARK = "distribution"
 
 
 def corners_only(sigma=0.5, distance=1000.0, seed=0):

@@ -1,24 +1,9 @@
 """The published 184 m fault: detected as often as the non-central law says, which is not often enough."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-PATH = Path(__file__).parents[1] / "benchmarks" / "threshold_fault.py"
-
-
-@pytest.fixture(scope="module")
-def benchmark():
-    spec = importlib.util.spec_from_file_location("threshold_fault", PATH)
-    module = importlib.util.module_from_spec(spec)
-    import sys
-
-    sys.modules["threshold_fault"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["threshold_fault"]
+BENCHMARK = "threshold_fault"
 
 
 @pytest.mark.parametrize(

@@ -176,7 +176,7 @@ def solve(
     # After an exclusion no level is promised; without a check there is nothing to promise it of.
     if verdict.decision.value != "not-monitored" and not found.excluded:
         levels = protection_levels(estimate, false_alarm_rate=false_alarm_rate)
-        record["levels"] = {axis: v if v < float("inf") else None for axis, v in levels.levels._asdict().items()}
+        record["levels"] = levels.to_dict()
     if as_json:
         _print_json(record)
         return

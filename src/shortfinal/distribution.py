@@ -16,18 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shortfinal.errors import InputError
-from shortfinal.geometry import Pose, copy_kernel, frozen, kernel
-from shortfinal.pose import (
-    _NO_START,
-    PoseEstimate,
-    _admit_kernel,
-    _evaluate_kernel,
-    _Given,
-    _problem_kernel,
-    _state_kernel,
-    _work_size,
-    estimate_pose_batch,
-)
+from shortfinal.geometry import Pose
+from shortfinal.pose import PoseEstimate, estimate_pose_batch, pose_costs
 
 Array = NDArray[np.float64]
 
@@ -239,32 +229,3 @@ class _Density:
         turn = np.linalg.norm(steps[:, 3:], axis=1)
         uniform = 2.0 * np.log(np.sinc(np.minimum(turn, 3.0) / (2.0 * np.pi)))
         return np.where(physical & (turn < np.pi), -0.5 * np.where(physical, costs, 0.0) + uniform + volume, -np.inf)
-
-
-def pose_costs(est: PoseEstimate, positions: Array, rotations: Array) -> Array:
-    """The solver's cost J (N,) at poses (N, 3), (N, 3, 3), of what `est` was estimated from; infinite
-    where a point lies behind the camera.
-    """
-    given = _Given(est.attitude_prior, est.position_prior, est.altitude, est.lines, est.edges).arrays()
-    rows, out = len(est.residual), np.empty(len(positions))
-    work = np.empty(_work_size(len(est.points), len(given[2]), rows))
-    _costs_kernel(
-        est.keypoints.mean_px, est.keypoints.cov_px, est.points, *given, _NO_START, est.camera.intrinsics, rows,
-        *(frozen(np.array(a, np.float64, order="C")) for a in (positions, rotations)), work, out,
-    )  # fmt: skip
-    return out
-
-
-@kernel
-def _costs_kernel(  # type: ignore[no-untyped-def]
-    mean, cov, points, line_mean, line_cov, edges, attitude, position, altitude, initial, lens, rows, positions,
-    rotations, work, out,
-):  # fmt: skip
-    priors = (attitude.shape[0], position.shape[0], altitude.shape[0])
-    problem, end = _problem_kernel(points, edges, lens, priors, rows, work)
-    state, end = _state_kernel(work, end, rows)
-    _admit_kernel(problem, mean, cov, line_mean, line_cov, attitude, position, altitude, initial)
-    for i in range(out.shape[0]):
-        copy_kernel(positions[i], state.position)
-        copy_kernel(rotations[i].reshape(9), state.rotation.reshape(9))
-        out[i] = _evaluate_kernel(problem, state)

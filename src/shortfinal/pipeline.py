@@ -64,8 +64,7 @@ class FrameResult:
             record["attitude_deg"] = list(self.estimate.pose.attitude)
             record["pose_cov"] = self.estimate.cov.tolist()
         if self.protection is not None:
-            levels = self.protection.levels._asdict()
-            record["protection"] = {axis: level if math.isfinite(level) else None for axis, level in levels.items()}
+            record["protection"] = self.protection.to_dict()
         return record
 
 

@@ -364,6 +364,20 @@ def estimate_pose_batch(
     )  # fmt: skip
 
 
+def pose_costs(est: PoseEstimate, positions: Array, rotations: Array) -> Array:
+    """The solver's cost J (N,) at poses (N, 3), (N, 3, 3), of what `est` was estimated from; infinite
+    where a point lies behind the camera.
+    """
+    given = _Given(est.attitude_prior, est.position_prior, est.altitude, est.lines, est.edges).arrays()
+    rows, out = len(est.residual), np.empty(len(positions))
+    work = np.empty(_work_size(len(est.points), len(given[2]), rows))
+    _costs_kernel(
+        est.keypoints.mean_px, est.keypoints.cov_px, est.points, *given, _NO_START, est.camera.intrinsics, rows,
+        *(frozen(np.array(a, np.float64, order="C")) for a in (positions, rotations)), work, out,
+    )  # fmt: skip
+    return out
+
+
 _ABSENT = tuple(frozen(np.empty(shape)) for shape in ((0, 2), (0, 0), (0, 2, 3), (0, 18), (0, 12), (0, 2)))
 _NO_START = frozen(np.empty((0, 12)))
 _SUMMARY = 5  # status, χ², iterations, sharp rows, relative sigma
@@ -694,6 +708,21 @@ def _solve_kernel(  # type: ignore[no-untyped-def]
         jacobian_out[:] = math.nan
         cov_out[:] = math.nan
         summary[1], summary[3], summary[4] = math.nan, 0.0, math.nan
+
+
+@kernel
+def _costs_kernel(  # type: ignore[no-untyped-def]
+    mean, cov, points, line_mean, line_cov, edges, attitude, position, altitude, initial, lens, rows, positions,
+    rotations, work, out,
+):  # fmt: skip
+    priors = (attitude.shape[0], position.shape[0], altitude.shape[0])
+    problem, end = _problem_kernel(points, edges, lens, priors, rows, work)
+    state, end = _state_kernel(work, end, rows)
+    _admit_kernel(problem, mean, cov, line_mean, line_cov, attitude, position, altitude, initial)
+    for i in range(out.shape[0]):
+        copy_kernel(positions[i], state.position)
+        copy_kernel(rotations[i].reshape(9), state.rotation.reshape(9))
+        out[i] = _evaluate_kernel(problem, state)
 
 
 @inlined

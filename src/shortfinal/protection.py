@@ -144,6 +144,10 @@ class ProtectionLevels:
         """The five levels."""
         return PerAxis(self.along_m, self.cross_m, self.vertical_m, self.lateral_deg, self.vertical_deg)
 
+    def to_dict(self) -> dict[str, float | None]:
+        """The levels by name, for JSON, which knows no infinity: None where there is no level."""
+        return {axis: level if math.isfinite(level) else None for axis, level in self.levels._asdict().items()}
+
     def available(self, limits: AlertLimits) -> Availability:
         """Are all levels within the alert limits?"""
         reasons = tuple(
