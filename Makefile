@@ -37,5 +37,5 @@ clean:
 
 .venv/dev: .venv/base
 	@echo "installing the training and development tools into .venv (once) ..."
-	$(PIP) -e ".[train,cluster,posterior]" --group dev
+	$(PIP) -e ".[train,data,cluster,posterior]" --group dev
 	@touch $@

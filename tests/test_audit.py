@@ -14,7 +14,7 @@ from test_lard import EARTH_STUDIO, RUNWAYS, SAMPLE, SWAPS, TEST_SYNTH, V2_HEAD,
 import shortfinal as sf
 from shortfinal.audit import Finding, audit_file, audit_labels, render_summary, report_as_dict, write_report
 from shortfinal.data.lard import RunwayLabel, read_labels
-from shortfinal.runway import find_in_database, load_database
+from shortfinal.runway import lard_database, load_database
 
 CORNERS = sf.Runway(2500, 45).corners
 SIGMA_PX = 12**-0.5
@@ -30,8 +30,9 @@ def lard_entry(heading_deg=57.0):
     return {c: {"coordinate": dict(zip(keys, lla[k]))} for c, k in zip("CDBA", range(4))}
 
 
-DATABASE = {"TEST": {"01": lard_entry()}}
-RUNWAY = find_in_database(DATABASE, "TEST/01")
+ENTRIES = {"TEST": {"01": lard_entry()}}
+DATABASE = lard_database(ENTRIES, "database")
+RUNWAY = DATABASE.find("TEST/01")
 
 
 def approach(rng):
@@ -80,7 +81,7 @@ def shifted(labels, database, rng, size_px=5.0):
     moved, chances = [], []
     for label in labels:
         keypoints = sf.GaussianKeypoints.from_sigma(label.corners_px, SIGMA_PX)
-        runway = find_in_database(database, label.ident)
+        runway = database.find(label.ident)
         estimate = sf.estimate_pose(keypoints, runway.corners, label.camera)
         angle, shift = rng.uniform(0, 2 * np.pi), np.zeros((4, 2))
         shift[rng.integers(4)] = size_px * np.cos(angle), size_px * np.sin(angle)
@@ -116,7 +117,7 @@ def test_of_200_labels_with_two_corners_swapped_all_are_named(tmp_path, row):
     names = "ABCD" if row is v1_row else ("BL", "BR", "TR", "TL")
     labels, rows = labels_with(whole_pixels, 400, seed=2), []
     for k, label in enumerate(labels):
-        cells = row(label.corners_px, slant_distance=str(label.distance_m / 1852))
+        cells = row(label.corners_px, slant_distance=str(label.distance_m / 1852), image=label.image)
         if k % 2:
             a, b = (names[i] for i in SWAPS[k // 2 % len(SWAPS)])
             for axis in "xy":
@@ -285,10 +286,12 @@ def test_the_written_report(tmp_path):
 
 def test_a_file_from_end_to_end(tmp_path):
     labels = labels_with(whole_pixels, 30)
-    rows = [v1_row(label.corners_px, slant_distance=f"{label.distance_m / 1852:.2f}") for label in labels]
+    rows = [
+        v1_row(label.corners_px, slant_distance=f"{label.distance_m / 1852:.2f}", image=label.image) for label in labels
+    ]
     path = write(tmp_path / "labels.csv", rows)
     runways = tmp_path / "runways.json"
-    runways.write_text(json.dumps(DATABASE))
+    runways.write_text(json.dumps(ENTRIES))
     report = audit_file(path, runways, tmp_path / "out")
     assert not report.contradicting
     assert not report.not_checked
@@ -311,11 +314,41 @@ def test_options_out_of_range_are_refused(options, words):
 
 
 def test_labels_without_a_camera_are_listed_as_not_checked(tmp_path):
-    path = write(tmp_path / "labels.csv", [v2_row(label.corners_px) for label in labels_with(whole_pixels, 2)])
-    (tmp_path / "runways.json").write_text(json.dumps(DATABASE))
+    labels = labels_with(whole_pixels, 2)
+    path = write(tmp_path / "labels.csv", [v2_row(label.corners_px, image=label.image) for label in labels])
+    (tmp_path / "runways.json").write_text(json.dumps(ENTRIES))
     report = audit_file(path, tmp_path / "runways.json", tmp_path / "out")
-    assert [a.note for a in report.not_checked] == ["camera unknown: pass --camera"] * 2
+    assert [a.note for a in report.not_checked] == ["camera unknown of flight_simulator pictures: pass --camera"] * 2
     assert "0 of 2 labels contradict the runway, 0 passed, 2 not checked" in screen(report)
+
+
+def test_refused_rows_are_told_and_never_pass(tmp_path):
+    labels = labels_with(whole_pixels, 8)
+    rows = [v1_row(label.corners_px, slant_distance="", image=label.image) for label in labels]
+    rows[2]["x_B"], rows[5]["airport"] = "12,5", ""
+    path = write(tmp_path / "labels.csv", rows)
+    (tmp_path / "runways.json").write_text(json.dumps(ENTRIES))
+    report = audit_file(path, tmp_path / "runways.json", tmp_path / "out")
+    assert [r.line for r in report.refused] == [4, 7]
+    assert len(report.labels) == 6
+    text = screen(report).replace("\n", "")
+    assert "0 of 6 labels contradict the runway, 6 passed, 0 not checked" in text
+    assert "2 rows are no labels, and were left out" in text
+    assert "line 4: x_B is '12,5'" in text
+    content = json.loads((tmp_path / "out" / "audit.json").read_text())
+    assert (content["labels"], content["refused"]) == (6, 2)
+    with open(tmp_path / "out" / "audit.csv", newline="") as file:
+        written = {row["line"]: row for row in csv.DictReader(file)}
+    assert {line for line, row in written.items() if row["verdict"] == "passed"} == {"2", "3", "5", "6", "8", "9"}
+    for line in ("4", "7"):
+        assert written[line]["verdict"] == "refused"
+        assert f"line {line}" in written[line]["note"]
+        assert written[line]["p_value"] == ""
+
+
+def test_a_real_picture_without_a_runway_is_not_checked():
+    label = replace(labels_with(whole_pixels, 1)[0], ident="")
+    assert audit_labels([label], DATABASE).not_checked[0].note == "the label names no runway"
 
 
 def test_a_tiny_rate_has_a_finite_tolerance():
@@ -326,7 +359,7 @@ def test_a_tiny_rate_has_a_finite_tolerance():
 def test_files_that_cannot_be_used_are_refused(tmp_path):
     px = labels_with(whole_pixels, 1)[0].corners_px
     path, runways = write(tmp_path / "labels.csv", [v2_row(px)]), tmp_path / "runways.json"
-    runways.write_text(json.dumps(DATABASE))
+    runways.write_text(json.dumps(ENTRIES))
     with pytest.raises(sf.InputError, match=r"missing\.json"):
         audit_file(path, tmp_path / "missing.json", tmp_path / "out", camera=EARTH_STUDIO)
     with pytest.raises(sf.InputError, match=r"labels\.csv: cannot make the output folder"):
@@ -356,6 +389,7 @@ def test_a_runway_missing_from_the_database_is_told():
     report = audit_labels(read_labels(V2_HEAD), load_database(RUNWAYS), camera=EARTH_STUDIO)
     assert len(report.not_checked) == 3
     assert "unknown runway 'CYEG/20'" in report.not_checked[0].note
+    assert "LARD's runways_db_V2_FLSim.json has the runways of these labels" in report.not_checked[0].note
 
 
 @needs_data
@@ -366,7 +400,8 @@ def test_200_swaps_in_a_real_file_are_all_named(tmp_path, path):
     names = "ABCD" if path == TEST_SYNTH else ("BL", "BR", "TR", "TL")
     rng = np.random.default_rng(7)
     rows = [dict(rows[i]) for i in rng.integers(len(rows), size=200)]
-    for row in rows:
+    for k, row in enumerate(rows):
+        row["image"] = f"{k}.jpeg"
         a, b = rng.choice(list(names), 2, replace=False)
         for axis in "xy":
             row[f"{axis}_{a}"], row[f"{axis}_{b}"] = row[f"{axis}_{b}"], row[f"{axis}_{a}"]

@@ -284,7 +284,7 @@ def test_runways_that_are_unknown(folder, capsys, monkeypatch):
     assert "no runway database" in refused(capsys, *base, "--runway", "LFPO/24")
     (folder / "runways.json").write_text('{"LFPO": {"06": {}}}')
     err = refused(capsys, *base, "--runway", "LFPO/24", "--runways", folder / "runways.json")
-    assert "unknown runway 'LFPO/24' among 1; nearest: LFPO/06" in err
+    assert "unknown runway 'LFPO/24'; nearest: LFPO/06" in err
     assert "--size: '2000'" in refused(capsys, *base, "--size", "2000")
 
 

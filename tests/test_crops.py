@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
-from scipy.stats import ks_2samp
+from scipy.stats import chi2_contingency, chisquare, ks_2samp
 
 import shortfinal as sf
-from shortfinal.crops import bogo_crop, box_around, centre_crop
+from shortfinal.crops import bogo_crop, box_around, centre_crop, inverse_crop, native_crop
+from shortfinal.detector import crop_image
 
 BOX = np.array([100.0, 50.0, 180.0, 90.0])
 
@@ -18,14 +19,27 @@ def test_the_centre_crop_is_centred_and_has_its_margin():
     assert window.apply([140, 70]) == pytest.approx([111.5, 111.5])
 
 
-def test_bogo_crops_are_distributed_as_by_rejection():
-    # The paper's loop: any position around, until one holds the box.
+def same_distribution(one, other, bins=5):
+    """p-values of two samples (N, 2), (M, 2): Kolmogorov-Smirnov by axis, and chi-square over a joint grid."""
+    edges = [np.quantile(np.concatenate([one, other])[:, axis], np.linspace(0, 1, bins + 1)) for axis in range(2)]
+    counts = np.array([np.histogram2d(*sample.T, bins=edges)[0].ravel() for sample in (one, other)])
+    joint = chi2_contingency(counts[:, counts.sum(axis=0) > 0]).pvalue
+    return [*(ks_2samp(one[:, axis], other[:, axis]).pvalue for axis in range(2)), joint]
+
+
+@pytest.mark.parametrize("image_size", [None, (230, 400), (110, 400)], ids=["anywhere", "inside", "image inside"])
+def test_bogo_crops_are_distributed_as_by_rejection(image_size):
+    # The paper's loop: any position around, until one holds the box (and lies in the image).
+    box = np.array([20.0, 10.0, 100.0, 60.0])
     rng = np.random.default_rng(3)
-    direct = np.array([(w.left, w.top) for w in (bogo_crop(BOX, 1.5, 224, rng) for _ in range(4000))])
-    tries = rng.uniform([0, -100], [250, 150], (120_000, 2))
-    inside = (tries <= BOX[:2] + 0.5).all(axis=1) & (tries + 120 >= BOX[2:] + 0.5).all(axis=1)
-    for axis in range(2):
-        assert ks_2samp(direct[:, axis], tries[inside, axis]).pvalue > 0.01
+    crops = (bogo_crop(box, 1.5, 224, rng, image_size=image_size) for _ in range(4000))
+    direct = np.array([(w.left, w.top) for w in crops])
+    tries = rng.uniform([-110, -110], [210, 210], (200_000, 2))
+    kept = (tries <= box[:2] + 0.5).all(axis=1) & (tries + 120 >= box[2:] + 0.5).all(axis=1)
+    if image_size:
+        over = np.array(image_size) - 120.0
+        kept &= ((tries >= np.minimum(0, over)) & (tries <= np.maximum(0, over))).all(axis=1)
+    assert min(same_distribution(direct, tries[kept])) > 0.001
 
 
 def test_bogo_crops_keep_their_slack():
@@ -34,6 +48,134 @@ def test_bogo_crops_keep_their_slack():
         px = bogo_crop(BOX, 1.5, 100, rng, slack=0.1).apply(BOX.reshape(2, 2))
         assert (px > 9).all()
         assert (px < 90).all()
+
+
+def test_a_bogo_crop_as_large_as_the_image_is_the_image():
+    # Where there is one position it is taken, not the box's centre.
+    for margin in np.linspace(1.3, 1.9, 13):
+        window = bogo_crop([0, 3, 50, 40], margin, 64, np.random.default_rng(0), image_size=(90, 50 * margin))
+        assert window.top == pytest.approx(0, abs=1e-9)
+
+
+def paper_positions(box, image_size, size, margin, factor):
+    """Every whole-pixel crop of the halved image that the paper's loop would accept, (N, 2), by trying all.
+
+    With one mend: the margin is not wanted beyond the image, or the loop would never end there.
+    """
+    width, height = (n // factor for n in image_size)
+    left, top = np.meshgrid(np.arange(width - size + 1), np.arange(height - size + 1), indexing="ij")
+    tries = np.column_stack([left.ravel(), top.ravel()])
+    edges = (np.asarray(box) + 0.5) / factor
+    low = np.maximum(edges[:2] - margin, 0)
+    high = np.minimum(edges[2:] + margin, [width, height])
+    fits = (tries <= low).all(axis=1) & (tries + size >= high).all(axis=1)
+    return tries[fits]
+
+
+@pytest.mark.parametrize(
+    ("box", "image_size", "factor"),
+    [
+        ([30, 34.2, 38.7, 41], (70, 61), 1),  # native
+        ([12, 11, 38.6, 30], (71, 61), 2),  # halved, odd sides
+        ([3, 20, 50, 75], (133, 127), 4),  # the margin ends at the image's border
+    ],
+)
+def test_native_crops_are_distributed_as_by_the_papers_loop(box, image_size, factor):
+    rng = np.random.default_rng(5)
+    size, margin = 16 if factor < 4 else 20, 1.0
+    windows = [native_crop(box, image_size, rng, size, margin) for _ in range(6000)]
+    assert {w.width for w in windows} == {size * factor}
+    drawn = np.array([(w.left / factor, w.top / factor) for w in windows])
+    np.testing.assert_array_equal(drawn, np.round(drawn))
+    positions = paper_positions(box, image_size, size, margin, factor)
+    counts = [np.sum((drawn == place).all(axis=1)) for place in positions]
+    assert sum(counts) == len(drawn)  # no other position
+    assert chisquare(counts).pvalue > 0.001
+    if factor > 1:  # and none would fit with one halving less
+        assert not len(paper_positions(box, image_size, size, margin, factor // 2))
+
+
+def test_native_crops_of_small_images_and_at_borders():
+    rng = np.random.default_rng(6)
+    for _ in range(100):
+        window = native_crop([2, 3, 30, 38], (50, 40), rng, 64)
+        assert window.width == 64
+        assert window.left <= 0 <= 50 <= window.left + 64  # the whole image is in it
+        assert window.top <= 0 <= 40 <= window.top + 64
+        window = native_crop([0, 0, 20, 98.5], (301, 301), rng, 128, 8.0)  # no margin beyond the border
+        assert (window.left, window.top) == (0, 0) or window.left >= 0
+    window = native_crop([0, 0, 300, 300], (301, 301), rng, 128, 8.0)  # in the odd last column
+    assert (window.apply([300, 300]) < 127.5).all()
+
+
+def test_halved_crops_are_block_means_to_the_pixel_centre():
+    # Odd sides, any number of halvings, windows at any whole pixel, over the border as well.
+    rng = np.random.default_rng(7)
+    image = rng.integers(0, 256, (83, 97, 3), dtype=np.uint8)
+    padded = np.pad(image, ((128, 128), (128, 128), (0, 0))).astype(float)
+    for factor in (1, 2, 4, 8):
+        for left, top in [(0, 0), (1, 3), (7, 5), (-3, -9), (60, 50), *rng.integers(-60, 80, (30, 2))]:
+            window = sf.PixelWindow(int(left), int(top), 12 * factor, 8 * factor, 12, 8)
+            part = padded[128 + top :, 128 + left :][: 8 * factor, : 12 * factor]
+            means = part.reshape(8, factor, 12, factor, 3).mean(axis=(1, 3))
+            assert np.abs(crop_image(image, window) - means).max() <= 0.501  # rounding to whole levels
+    centre = sf.PixelWindow(4, 6, 48, 32, 12, 8).inverse([0, 0])
+    np.testing.assert_allclose(centre, [4 + 1.5, 6 + 1.5])  # the middle of the first 4 x 4 block
+
+
+def test_windows_between_pixels_agree_with_those_on_them():
+    # A ramp is its own block mean and its own interpolation: the crop must show it at the window's pixel centres.
+    v, u = np.mgrid[:120, :150]
+    ramp = np.repeat((0.7 * u + 0.9 * v)[..., None], 3, axis=2)
+    image = np.round(ramp).astype(np.uint8)
+    rng = np.random.default_rng(8)
+    for _ in range(60):
+        shrink = rng.uniform(0.3, 5)
+        window = sf.PixelWindow(*rng.uniform(8, 50, 2), 12 * shrink, 10 * shrink, 12, 10)
+        at = window.inverse(np.moveaxis(np.mgrid[:10, :12][::-1], 0, -1))
+        # Rounded twice or, averaged, three times; and OpenCV's positions are multiples of 1/32 block.
+        bound = 1.5 + 1.6 * max(1, int(shrink)) / 32
+        assert np.abs(crop_image(image, window)[..., 0] - (0.7 * at[..., 0] + 0.9 * at[..., 1])).max() < bound
+
+
+def touches(left, top, side, box, keep):
+    """Whether windows come closer than `keep` to the box."""
+    return (
+        (left < box[2] + 0.5 + keep)
+        & (left + side > box[0] + 0.5 - keep)
+        & (top < box[3] + 0.5 + keep)
+        & (top + side > box[1] + 0.5 - keep)
+    )
+
+
+@pytest.mark.parametrize(
+    "box", [BOX, [0, 0, 70, 50], [-20, 150, 40, 299]], ids=["within", "in a corner", "over a border"]
+)
+def test_inverse_crops_are_uniform_over_where_the_runway_is_not(box):
+    rng = np.random.default_rng(11)
+    size, box = np.array([400, 300]), np.asarray(box, float)
+    windows = [inverse_crop(box, (400, 300), 224, rng) for _ in range(8000)]
+    assert all(windows)
+    left, top, side = np.array([(w.left, w.top, w.width) for w in windows]).T
+    assert ((left >= 0) & (left + side <= 400) & (top >= 0) & (top + side <= 300)).all()
+    assert not touches(left, top, side - 1e-9, box, 0.05 * side).any()
+    longer = (box[2:] - box[:2]).max()
+    assert (side >= 1.15 * longer).all()
+    assert (side <= 1.9 * longer).all()
+    # The loop: for each of the same scales, positions in the image until one keeps clear of the box.
+    scales = np.repeat(side, 60)
+    tries = rng.uniform(0, 1, (len(scales), 2)) * (size - scales[:, None])
+    clear = ~touches(tries[:, 0], tries[:, 1], scales, box, 0.05 * scales)
+    groups = clear.reshape(-1, 60)
+    assert groups.any(axis=1).all()
+    first = tries.reshape(-1, 60, 2)[np.arange(len(side)), groups.argmax(axis=1)]
+    assert min(same_distribution(np.column_stack([left, top]), first)) > 0.001
+
+
+def test_without_room_there_is_no_inverse_crop():
+    rng = np.random.default_rng(10)
+    assert inverse_crop([40, 40, 60, 110], (150, 150), 224, rng, clearance=0.6) is None
+    assert inverse_crop([0, 0, 149, 60], (150, 150), 224, rng) is None
 
 
 @pytest.mark.parametrize(
@@ -48,3 +190,17 @@ def test_bogo_crops_keep_their_slack():
 def test_a_box_that_is_none_is_refused(box, margin, message):
     with pytest.raises(sf.InputError, match=message):
         centre_crop(box, margin, 224)
+
+
+@pytest.mark.parametrize(
+    ("box", "margin_px", "message"),
+    [
+        ([10, 0, 5, 5], 8, "not left < right"),
+        ([-3, 0, 5, 5], 8, "reaches beyond the image of 100 x 80"),
+        ([0, 0, 5, 80], 8, "reaches beyond the image of 100 x 80"),
+        ([0, 0, 5, 5], 112, "margin_px: 112; between 0 and 111 for a crop of 224"),
+    ],
+)
+def test_a_native_crop_that_cannot_be_is_refused(box, margin_px, message):
+    with pytest.raises(sf.InputError, match=message):
+        native_crop(box, (100, 80), np.random.default_rng(0), 224, margin_px)

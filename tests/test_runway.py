@@ -1,11 +1,12 @@
 import json
+import os
 
 import numpy as np
 import pymap3d
 import pytest
 
 import shortfinal as sf
-from shortfinal.runway import find_in_database
+from shortfinal.runway import lard_database
 
 HOME = (48.0, 2.0, 100.0)
 
@@ -90,11 +91,18 @@ def test_look_up_by_name(tmp_path, monkeypatch):
     assert sf.find_runway("LFPO/24", path).length_m == pytest.approx(2000, abs=1e-6)
     monkeypatch.setenv("SHORTFINAL_RUNWAYS", str(path))
     assert sf.find_runway("lfpo-24").ident == "LFPO/24"
+    assert sf.find_runway("LFPO/2").ident == "LFPO/02"  # in the file as "02"
 
 
 @pytest.mark.parametrize(
     ("ident", "message"),
-    [("LFPO/06", r"unknown runway 'LFPO/06' among 2; nearest: LFPO/24"), ("LFPG/24", "nearest: LFPO/24")],
+    [
+        ("LFPO/06", r"unknown runway 'LFPO/06'; nearest: LFPO/02, LFPO/24$"),
+        ("LFPO", "nearest: LFPO/02, LFPO/24$"),
+        ("LFPG/24", "unknown runway 'LFPG/24'; nearest: LFPO/24$"),
+        ("LFP/2", "nearest: LFPO/02$"),
+        ("KJFK/24", "unknown runway 'KJFK/24'$"),
+    ],
 )
 def test_an_unknown_runway_names_the_nearest(tmp_path, ident, message):
     with pytest.raises(sf.InputError, match=message):
@@ -111,7 +119,21 @@ def test_the_files_faults_are_named(tmp_path, monkeypatch):
     with pytest.raises(sf.InputError, match="not a JSON"):
         sf.find_runway("LFPO/24", tmp_path / "bad.json")
     with pytest.raises(sf.InputError, match="no WGS84 coordinate"):
-        find_in_database({"AAAA": {"01": {"A": {}}}}, "AAAA/01")
+        lard_database({"AAAA": {"01": {"A": {}}}}, "database").find("AAAA/01")
+
+
+def test_a_file_is_read_again_when_it_has_changed(tmp_path):
+    path = database(tmp_path)
+    sf.find_runway("LFPO/24", path)
+    path.write_text(path.read_text().replace("LFPO", "LFPG"))
+    os.utime(path, ns=(0, 0))
+    assert sf.find_runway("LFPG/24", path).ident == "LFPG/24"
+
+
+@pytest.mark.parametrize("displaced", [-1, float("nan"), float("inf")])
+def test_a_displacement_is_not_negative(displaced):
+    with pytest.raises(sf.InputError, match=r"displaced_m is .*; it must be >= 0"):
+        sf.Runway(2000, 45, displaced_m=displaced)
 
 
 @pytest.mark.parametrize("size", [(0, 45), (2000, -1), (float("nan"), 45)])

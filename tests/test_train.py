@@ -10,8 +10,9 @@ from shortfinal.errors import JobError
 
 torch = pytest.importorskip("torch")
 
+from shortfinal.data.augment import training_crop  # noqa: E402
 from shortfinal.train.export import compare, export, load_network  # noqa: E402
-from shortfinal.train.fit import Recipe, train, training_crop  # noqa: E402
+from shortfinal.train.fit import Recipe, train  # noqa: E402
 from shortfinal.train.model import KeypointNet, gaussian_nll, soft_argmax, to_pixels, variance_px  # noqa: E402
 
 

@@ -23,14 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, chndtr, chndtrinc, ndtri
 
-from shortfinal.data.lard import RunwayLabel, read_labels
+from shortfinal.data.lard import Labels, RunwayLabel, read_labels
+from shortfinal.data.table import Refusal
 from shortfinal.errors import InputError
 from shortfinal.files import csv_text, make_folder, write_whole
 from shortfinal.geometry import Camera, project
 from shortfinal.integrity import Decision, check_integrity
 from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
 from shortfinal.pose import PoseEstimate, estimate_pose
-from shortfinal.runway import Runway, find_in_database, load_database
+from shortfinal.runway import Runway, RunwayDatabase, load_database
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,6 +47,7 @@ DISTANCE_ALLOWANCE = 0.002
 POWER = 0.99  # the chance of being found by which the blind spots are drawn
 SHIFT_PX = 5.0  # a slip of the hand, as the share missed is told for
 _DIRECTIONS = 16
+_REFUSED_SHOWN = 5  # on the screen; the files list them all
 
 
 class Finding(Enum):
@@ -95,6 +97,7 @@ class AuditReport:
     labels: tuple[AuditedLabel, ...]
     sigma_px: float | None  # given; None: each label's own rounding
     false_alarm_rate: float  # per label
+    refused: tuple[Refusal, ...] = ()  # rows of the file that are no labels
 
     @property
     def contradicting(self) -> tuple[AuditedLabel, ...]:
@@ -153,7 +156,7 @@ def audit_file(
 ) -> AuditReport:
     """Audit a LARD label file and write `audit.csv`, `audit.json` and `audit.png` into `out_dir`.
 
-    Options as in `audit_labels`. Raises InputError for an unreadable file.
+    Options as in `audit_labels`. Raises InputError for a file that cannot be read or has no good row.
     """
     labels = read_labels(labels_csv, camera)
     report = audit_labels(
@@ -169,7 +172,7 @@ def audit_file(
 
 def audit_labels(
     labels: Sequence[RunwayLabel],
-    database: dict[str, Any],
+    database: RunwayDatabase,
     *,
     sigma_px: float | None = None,
     false_alarm_rate: float = FALSE_ALARM_RATE,
@@ -180,7 +183,8 @@ def audit_labels(
 
     `sigma_px` is the standard deviation of a labelled coordinate (default: what rounding gives),
     `false_alarm_rate` the chance per label of naming a good one, `camera` the one for all labels
-    (default: each label's own). Raises InputError for a sigma or a rate out of range.
+    (default: each label's own). The rows that `read_labels` refused are listed in the report.
+    Raises InputError for a sigma or a rate out of range.
     """
     if sigma_px is not None and not (math.isfinite(sigma_px) and sigma_px > 0):
         raise InputError(f"sigma_px: got {sigma_px}; it must be finite and > 0")
@@ -188,18 +192,21 @@ def audit_labels(
         raise InputError(f"false_alarm_rate: got {false_alarm_rate}; it must lie between 0 and {POWER:g}")
     runways = {ident: _look_up(database, ident) for ident in {label.ident for label in labels}}
     audited = [
-        _audit(
+        audit_label(
             label, runways[label.ident], camera or label.camera, sigma_px or label.rounding_sigma_px, false_alarm_rate
         )
         for label in labels
     ]
-    return AuditReport(source, tuple(sorted(audited, key=_badness)), sigma_px, false_alarm_rate)
+    refused = labels.refused if isinstance(labels, Labels) else ()
+    return AuditReport(source, tuple(sorted(audited, key=_badness)), sigma_px, false_alarm_rate, refused)
 
 
-def _look_up(database: dict[str, Any], ident: str) -> Runway | str:
+def _look_up(database: RunwayDatabase, ident: str) -> Runway | str:
     """The runway, or why there is none."""
+    if not ident:
+        return "the label names no runway"
     try:
-        return find_in_database(database, ident)
+        return database.find(ident)
     except InputError as error:
         return str(error)
 
@@ -211,14 +218,24 @@ def _badness(audited: AuditedLabel) -> tuple[int, float, int]:
     return rank, -surprise, audited.label.line
 
 
-def _audit(
+def audit_label(
     label: RunwayLabel, runway: Runway | str, camera: Camera | None, sigma_px: float, rate: float
 ) -> AuditedLabel:
+    """Hold one label against its runway, or say why there is none; arguments as in `audit_labels`."""
     order = () if label.raw_order_ok else (Finding.ORDER,)
     if isinstance(runway, str) or camera is None:
-        return AuditedLabel(label, order, False, runway if isinstance(runway, str) else "camera unknown: pass --camera")
+        return AuditedLabel(label, order, False, _why_not(label, runway))
     estimate = estimate_pose(GaussianKeypoints.from_sigma(label.corners_px, sigma_px), runway.corners, camera)
     return _audit_estimate(label, estimate, order, rate)
+
+
+def _why_not(label: RunwayLabel, runway: Runway | str) -> str:
+    """Why a label could not be checked."""
+    if not isinstance(runway, str):
+        kind = f" of {label.picture.source} pictures" if label.picture.source else ""
+        return f"camera unknown{kind}: pass --camera"
+    database = label.picture.database
+    return f"{runway}; LARD's {database} has the runways of these labels" if label.ident and database else runway
 
 
 def _audit_estimate(
@@ -318,6 +335,7 @@ def report_as_dict(report: AuditReport) -> dict[str, Any]:
         "labels": len(report.labels),
         "contradicting": len(report.contradicting),
         "not_checked": len(report.not_checked),
+        "refused": len(report.refused),
         "findings": report.counts,
         "expected_false_alarms": report.expected_false_alarms,
         "sigma_ratio": _finite(report.sigma_ratio),
@@ -327,8 +345,15 @@ def report_as_dict(report: AuditReport) -> dict[str, Any]:
         },
         "shift_px": SHIFT_PX,
         "shift_missed": _finite(report.shift_missed),
-        "rows": [_row(audited) for audited in report.labels],
+        "rows": _rows(report),
     }
+
+
+def _rows(report: AuditReport) -> list[dict[str, Any]]:
+    """The table: the labels, worst first, and behind them the rows that are none."""
+    rows = [_row(audited) for audited in report.labels]
+    empty = dict.fromkeys(rows[0]) if rows else {}
+    return rows + [empty | {"line": r.line, "verdict": "refused", "note": r.message} for r in report.refused]
 
 
 def _row(audited: AuditedLabel) -> dict[str, Any]:
@@ -359,7 +384,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def _table(report: AuditReport) -> str:
-    rows = [_row(audited) for audited in report.labels]
+    rows = _rows(report)
     return csv_text(rows[0] if rows else ["line"], rows)
 
 
@@ -380,13 +405,17 @@ def _headline(report: AuditReport) -> RenderableType:
     passed = sum(a.verdict == "passed" for a in report.labels)
     text = Text(
         f"{bad} of {total} labels contradict the runway, {passed} passed, {unchecked} not checked",
-        style="bold red" if bad else "bold green" if passed and not unchecked else "bold yellow",
+        style="bold red" if bad else "bold green" if passed and not (unchecked or report.refused) else "bold yellow",
     )
     by_finding = ", ".join(f"{count} {name}" for name, count in report.counts.items() if count)
     text.append(f" ({by_finding})" if by_finding else "", style="default")
     if unchecked:
         idents = Counter(a.label.ident for a in report.not_checked)
         text.append(f"\n{unchecked} could not be checked: {', '.join(sorted(idents)[:8])}", style="bold yellow")
+    if report.refused:
+        text.append(f"\n{len(report.refused)} rows are no labels, and were left out:", style="bold yellow")
+        for refusal in report.refused[:_REFUSED_SHOWN]:
+            text.append(f"\n  {refusal.message}", style="default")
     return text
 
 
@@ -445,7 +474,7 @@ def _picture(report: AuditReport) -> bytes:
         draw(panel, report)
     figure.suptitle(
         f"{len(report.contradicting)} of {len(report.labels)} labels contradict the runway, "
-        f"{len(report.not_checked)} could not be checked"
+        f"{len(report.not_checked)} could not be checked, {len(report.refused)} rows refused"
     )
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110)

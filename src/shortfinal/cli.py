@@ -9,12 +9,21 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -42,7 +51,14 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instea
 Model = Annotated[Path | None, typer.Option(help="Model file (ONNX); the one that ships by default.")]
 Rate = Annotated[float, typer.Option(help="Share of faultless frames that may be refused.")]
 CameraFile = Annotated[Path | None, typer.Option(help="Camera (TOML): width, height, fx, fy, cx, cy, distortion.")]
-Runways = Annotated[Path | None, typer.Option(help="Runway database (LARD's JSON).", envvar="SHORTFINAL_RUNWAYS")]
+_DATABASE = "Runway database: LARD's JSON, or OurAirports' runways.csv or its folder."
+Runways = Annotated[Path | None, typer.Option(help=_DATABASE, envvar="SHORTFINAL_RUNWAYS")]
+DataSet = Annotated[Path, typer.Argument(help="Folder, or the file that holds or describes its labels: labels.csv, "
+                                              "COCO keypoints (.json), YOLO-pose (data.yaml).")]  # fmt: skip
+Corners = Annotated[str, typer.Option(help="The data set's names of near-left, near-right, far-right, far-left, "
+                                           "e.g. BL,BR,TR,TL, where they are not the usual ones.")]  # fmt: skip
+OriginName = Annotated[Literal["corner", "centre"], typer.Option(help="From where COCO keypoints count: the image's "
+                                                                 "corner, or its first pixel's centre.")]  # fmt: skip
 
 
 def main() -> None:
@@ -119,17 +135,19 @@ def run(
         _compile(levels=True)
     evaluation, results = _run_folder(folder, out, model, false_alarm_rate, quiet=as_json)
     if as_json:
-        _print_json(asdict(evaluation) | {"out": str(out)})
+        _print_json(asdict(evaluation) | {"rows_refused": len(folder.refused), "out": str(out)})
         return
     _print_evaluation(evaluation)
     _print_refused(results)
+    for refusal in folder.refused[:10]:
+        console.print(Text(f"left out: {refusal.message}"))
     console.print(f"written: {out}/frames.jsonl, evaluation.json, contact_sheet.png")
 
 
 @app.command()
 def audit(
     labels: Annotated[Path, typer.Argument(help="LARD label file (v1 or v2).")],
-    runways: Annotated[Path, typer.Option(help="Runway database (LARD's JSON).", envvar="SHORTFINAL_RUNWAYS")],
+    runways: Annotated[Path, typer.Option(help=_DATABASE, envvar="SHORTFINAL_RUNWAYS")],
     out: Out = Path("results/audit"),
     sigma_px: Annotated[float | None, typer.Option(help="Of a label; what rounding gives by default.")] = None,
     false_alarm_rate: Rate = 1e-3,
@@ -264,15 +282,115 @@ def data_render(
     count: Annotated[int, typer.Option(help="How many pictures.", min=1)],
     out: Annotated[Path, typer.Option(help="Folder of the data set.")],
     seed: Annotated[int, typer.Option(min=0)] = 0,
+    camera: Annotated[
+        Path | None, typer.Option(help="Camera (TOML): whole frames as it takes them, instead of views of the runway.")
+    ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Threads; all cores by default.")] = None,
 ) -> None:
     """Render a data set of random approaches with exact labels; run again to go on after a stop."""
     from shortfinal.data.dataset import write_dataset
+    from shortfinal.stream.source import read_camera
 
+    given = read_camera(camera) if camera else None
     with _bar() as bar:
         task = bar.add_task("rendering", total=count)
-        labels = write_dataset(out, count, seed, workers, lambda _: bar.advance(task))
+        labels = write_dataset(out, count, seed, workers, lambda _: bar.advance(task), given)
     console.print(f"written: {labels}")
+
+
+@data_app.command("check")
+def data_check(
+    source: DataSet,
+    out: Out = Path("results/check"),
+    runways: Runways = None,
+    camera: CameraFile = None,
+    corners: Corners = "",
+    origin: OriginName = "corner",
+    as_json: Json = False,
+) -> None:
+    """Is a data set fit to train on? Images, labels, duplicates, leakage between splits, distributions."""
+    from shortfinal.data.check import check_dataset, render_summary, report_as_dict
+    from shortfinal.stream.source import read_camera
+
+    given = read_camera(camera) if camera else None
+    if not as_json:
+        _compile()
+    with _counter("checking", quiet=as_json) as seen:
+        report = check_dataset(
+            source, out, runways=runways, camera=given, corners=_names(corners), origin=origin, progress=seen
+        )
+    if as_json:
+        _print_json(report_as_dict(report) | {"out": str(out)})
+    else:
+        console.print(render_summary(report), highlight=False, markup=False)
+        console.print(f"written: {out}/check.json, problems.csv, check.png, contact_sheet.png")
+    if report.serious:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in report.counts.items())
+        raise JobError(f"{source}: {len(report.serious)} problems ({kinds}); see {out}/problems.csv")
+
+
+@data_app.command("convert")
+def data_convert(
+    source: DataSet,
+    out: Annotated[Path, typer.Argument(help="Folder to write; it must not be there, or be empty.")],
+    to: Annotated[Literal["coco", "yolo"], typer.Option(help="COCO keypoints, or YOLO-pose.")],
+    split: Annotated[
+        str, typer.Option(help="Shares of train, val, test, e.g. 0.8,0.1,0.1: split anew by airport.")
+    ] = "",
+    seed: Annotated[int, typer.Option(min=0, help="Of the split.")] = 0,
+    corners: Corners = "",
+    origin: OriginName = "corner",
+    as_json: Json = False,
+) -> None:
+    """Write a data set, of whatever format, as COCO keypoints or YOLO-pose; images are linked or copied."""
+    from shortfinal.data.formats import convert
+
+    try:
+        fractions = [float(share) for share in _names(split)]
+    except ValueError as error:
+        raise InputError(f"--split: {split!r}; expected shares of train, val, test, e.g. 0.8,0.1,0.1") from error
+    with _counter("writing", quiet=as_json) as seen:
+        done = convert(
+            source, out, to, corners=_names(corners), origin=origin, fractions=fractions, seed=seed, progress=seen
+        )
+    if as_json:
+        _print_json(asdict(done) | {"out": str(out)})
+        return
+    for line in (*done.refused[:10], *done.notes):
+        console.print(str(line), highlight=False, markup=False)
+    if len(done.refused) > 10:
+        console.print(f"... and {len(done.refused) - 10} more left out")
+    if done.outside:
+        console.print(f"{done.outside} corners outside their picture are written as not labelled: YOLO has no room")
+    splits = ", ".join(f"{count} {split or 'without split'}" for split, count in done.splits.items())
+    console.print(f"written: {out}, {done.pictures} pictures ({splits}), {done.labels} labels")
+
+
+@data_app.command("fetch")
+def data_fetch(
+    name: Annotated[str, typer.Argument(help="lard-v1, lard-v2 or ourairports.")],
+    out: Annotated[Path, typer.Option(help="Folder for the files; made if it does not exist.")],
+    subset: Annotated[list[str] | None, typer.Option(help="Part to fetch; may be repeated. LARD v2: ges, arcgis, "
+                                                          "bingmaps, xplane, flsim. LARD v1: a word of an archive's "
+                                                          "name, e.g. BIRK. All by default.")] = None,
+    url: Annotated[str | None, typer.Option(help="Address of the service, if not the public one.")] = None,
+) -> None:  # fmt: skip
+    """Fetch a public data set, checked and unpacked; run again to go on after a stop."""
+    from shortfinal.data.fetch import fetch_files, list_files, unpack_archives
+
+    with console.status("asking what there is ..."):
+        listing = list_files(name, url=url, subsets=subset or ())
+    with _bytes_bar() as bar:
+        fetching = bar.add_task("fetching", total=listing.size or None)
+        files = fetch_files(listing, out, progress=lambda n: bar.advance(fetching, n))
+        if listing.archives:
+            unpacking = bar.add_task("unpacking", total=sum(a.size or 0 for a in listing.archives))
+            unpack_archives(listing, out, progress=lambda n: bar.advance(unpacking, n))
+    console.print(f"written: {out} ({len(files)} files, {len(listing.archives)} of them unpacked)")
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")] if text else []
 
 
 def _run_folder(
@@ -331,6 +449,24 @@ def _bar() -> Progress:
     return Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
     )
+
+
+def _bytes_bar() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn(),
+        console=console,
+    )  # fmt: skip
+
+
+@contextmanager
+def _counter(what: str, *, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """A bar moved by a function of (how many are done, of so many)."""
+    if quiet:
+        yield None
+        return
+    with _bar() as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 @contextmanager

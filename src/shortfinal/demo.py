@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shortfinal.data.scene import Scene, Sensor, random_scene, render
 from shortfinal.detector import KeypointDetector
 from shortfinal.files import make_folder, write_png, write_whole
 from shortfinal.geometry import Camera, Pose, project
@@ -21,6 +20,8 @@ from shortfinal.keypoints import GaussianKeypoints
 from shortfinal.pipeline import FrameResult, LandingPipeline
 from shortfinal.pose import PoseEstimate
 from shortfinal.runway import Runway
+from shortfinal.scene.render import Scene, random_scene, render
+from shortfinal.scene.sensor import Sensor
 from shortfinal.stream.overlay import Notes, contact_sheet, draw_result
 from shortfinal.stream.sink import JsonlWriter, VideoWriter
 
@@ -35,7 +36,7 @@ START_M, END_M = 3000.0, 140.0  # distance to the threshold
 GLIDE_DEG, AIM_M = 3.0, 305.0
 SHORT_M = 184.0  # by how much the paper misplaces the far threshold
 _TAXIWAY_EDGE_M = (-1.0, -52.0, 0.0)  # where the scene's taxiway meets the threshold's line
-_SEED = 53
+_SEED = 54
 
 
 class Fault(Enum):
@@ -93,12 +94,12 @@ def demo_scene() -> Scene:
     """The embedded airfield: a seeded scene, its runway of weathered asphalt, a taxiway at the threshold."""
     scene = random_scene(np.random.default_rng(_SEED), RUNWAY)
     surface, grey = np.array([0.40, 0.40, 0.41]), np.array([0.47, 0.47, 0.46])
-    strips = scene.strips.copy()
-    strips[:, 5:] = grey
-    strips[0, :5] = [8.0, 0.0, 8.0, -150.0, 9.0]
-    strips[1, :5] = [-60.0, -150.0, RUNWAY.length_m + 60, -150.0, 11.0]
-    pad = np.array([[60.0, *(0.9 * surface), 2.0, 0.0]] * 2)
-    return scene._replace(surface=surface, shoulder=0.9 * surface, wear=0.15, strips=strips, pad=pad)
+    strips = np.zeros_like(scene.airfield.strips)
+    strips[0] = [8.0, 0.0, 8.0, -150.0, 9.0, *grey, 1.0]
+    strips[1] = [-60.0, -150.0, RUNWAY.length_m + 60, -150.0, 11.0, *grey, 1.0]
+    pad = np.array([[60.0, *(0.9 * surface), 2.0, 0.0, 1.0]] * 2)
+    airfield = scene.airfield._replace(surface=surface, shoulder=0.9 * surface, wear=0.15, strips=strips, pad=pad)
+    return scene._replace(airfield=airfield)
 
 
 def render_frame(scene: Scene, frame: int) -> Image:

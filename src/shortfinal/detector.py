@@ -21,6 +21,7 @@ from shortfinal.geometry import PixelWindow
 from shortfinal.keypoints import GaussianKeypoints
 
 Image = NDArray[np.uint8]
+Ints = NDArray[np.int_]
 
 METADATA_KEY = "shortfinal"
 FORMAT = 1
@@ -129,36 +130,55 @@ def crop_image(image: Image, window: PixelWindow) -> Image:
 
     Shrinking by two or more averages whole blocks first, so nothing aliases; then bilinear.
     """
-    shrink = [max(1, math.floor(1.0 / s)) for s in window.scale]
-    if max(shrink) > 1:
-        image, window = _shrunk(image, window, shrink[0], shrink[1])
     sx, sy = window.scale
     # Output pixel to source pixel: PixelWindow.inverse, as a matrix.
-    matrix = np.array([[1 / sx, 0, 0.5 / sx + window.left - 0.5], [0, 1 / sy, 0.5 / sy + window.top - 0.5]])
+    image_from_crop = np.array([[1 / sx, 0, 0.5 / sx + window.left - 0.5], [0, 1 / sy, 0.5 / sy + window.top - 0.5]])
+    return warp_image(image, image_from_crop, (window.out_width, window.out_height))
+
+
+def warp_image(
+    image: Image, image_from_crop: NDArray[np.float64], out_size: tuple[int, int], border: int = cv2.BORDER_CONSTANT
+) -> Image:
+    """The picture (height, width, 3) whose pixel (u, v) is the image's at `image_from_crop` (2, 3) @ (u, v, 1).
+
+    `out_size` is (width, height). Where that shrinks the image k-fold or more, blocks of k are averaged
+    first, counted from the first whole pixel of the region that is needed: a window of whole pixels
+    and scale 1/k gets the mean of its blocks, exactly. `border`: OpenCV's, black if not given.
+    """
+    width, height = out_size
+    matrix = np.array(image_from_crop, float)
+    # 1e-6: rounding in the matrix must not move a whole pixel, nor lose a whole factor.
+    shrink = np.maximum(1, np.floor(np.linalg.norm(matrix[:, :2], axis=1) + 1e-6)).astype(int)
+    if shrink.max() > 1:
+        outline = np.array([[-0.5, width - 0.5, -0.5, width - 0.5], [-0.5, -0.5, height - 0.5, height - 0.5], [1] * 4])
+        edges = matrix @ outline + 0.5
+        origin = np.floor(edges.min(axis=1) + 1e-6).astype(int)
+        needed = np.ceil((edges.max(axis=1) - origin) / shrink - 1e-6).astype(int)
+        image, first = _block_means(image, origin, needed, shrink, border)
+        matrix[:, 2] += 0.5 - (origin + first * shrink)
+        matrix = matrix / shrink[:, None]
+        matrix[:, 2] -= 0.5
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    out = cv2.warpAffine(
-        image, matrix, (window.out_width, window.out_height), flags=flags, borderMode=cv2.BORDER_CONSTANT
-    )
-    return np.asarray(out, np.uint8)
+    return np.asarray(cv2.warpAffine(image, matrix, out_size, flags=flags, borderMode=border), np.uint8)
 
 
-def _shrunk(image: Image, window: PixelWindow, kx: int, ky: int) -> tuple[Image, PixelWindow]:
-    """Block averages of the part of the image that the window needs, and the window upon them."""
-    height, width = image.shape[:2]
-    x0, y0 = max(0, math.floor(window.left) - kx), max(0, math.floor(window.top) - ky)
-    x1 = min(width, math.ceil(window.left + window.width) + kx)
-    y1 = min(height, math.ceil(window.top + window.height) + ky)
-    columns, rows = max(0, x1 - x0) // kx, max(0, y1 - y0) // ky
-    if columns == 0 or rows == 0:
-        black = np.zeros((1, 1, 3), np.uint8)
-        return black, PixelWindow(10.0, 10.0, window.width, window.height, window.out_width, window.out_height)
-    part = image[y0 : y0 + rows * ky, x0 : x0 + columns * kx]
-    small = cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA)
-    moved = PixelWindow(
-        (window.left - x0) / kx, (window.top - y0) / ky, window.width / kx, window.height / ky,
-        window.out_width, window.out_height,
-    )  # fmt: skip
-    return np.asarray(small, np.uint8), moved
+def _block_means(image: Image, origin: Ints, needed: Ints, shrink: Ints, border: int) -> tuple[Image, Ints]:
+    """Means of blocks of `shrink` pixels (x, y), the `needed` blocks from `origin` on as far as the image reaches.
+
+    Beside them, the number of the first block. Blocks across the border count what `border` puts beyond it.
+    """
+    size = np.array([image.shape[1], image.shape[0]])
+    first = np.maximum(0, -origin // shrink)
+    last = np.minimum(needed, -((origin - size) // shrink))
+    if (last <= first).any():
+        return np.zeros((1, 1, 3), np.uint8), first + 10 * needed  # out of sight
+    start, end = origin + first * shrink, origin + last * shrink
+    inside = image[max(0, start[1]) : end[1], max(0, start[0]) : end[0]]
+    (left, top), (right, bottom) = np.maximum(0, -start), np.maximum(0, end - size)
+    if max(left, top, right, bottom) > 0:
+        inside = np.asarray(cv2.copyMakeBorder(inside, top, bottom, left, right, border), np.uint8)
+    columns, rows = (int(n) for n in last - first)
+    return np.asarray(cv2.resize(inside, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8), first
 
 
 def normalise(crop: Image, mean: tuple[float, ...], std: tuple[float, ...]) -> NDArray[np.float32]:

@@ -249,6 +249,11 @@ def project(camera: Camera, pose: Pose, points: ArrayLike) -> Array:
     return px
 
 
+def can_project(camera: Camera, pose: Pose, points: ArrayLike) -> NDArray[np.bool_]:
+    """Which (K,) of `points` (K, 3) `project` has pixels for."""
+    return np.asarray(_project_all(camera, pose, points)[2] > 0)
+
+
 def project_jacobian(camera: Camera, pose: Pose, points: ArrayLike) -> Array:
     """d(pixels) / d(local increment) of the pose, (2K, 6): pixels per metre and per radian.
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
+import functools
+import operator
 import os
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,13 +40,16 @@ class Runway:
     """A landing direction of a runway, in its own frame (origin: centre of the landing threshold).
 
     `corners` (4, 3), metres, in keypoint order: near-left, near-right, far-right, far-left. Given
-    none, they are the flat rectangle. Raises InputError for a size that is not positive.
+    none, they are the flat rectangle. The near ones are the landing threshold's; the far ones end the
+    runway's surface, whether or not the threshold of the other direction is displaced. Raises
+    InputError for a size that is not positive.
     """
 
     length_m: float
     width_m: float
     ident: str = ""  # airport and landing direction, e.g. "LFPO/24"
     corners: Array = None  # type: ignore[assignment]  # set from the size if not given
+    displaced_m: float = 0.0  # how far the surface begins before the landing threshold
 
     def __post_init__(self) -> None:
         for name in ("length_m", "width_m"):
@@ -51,6 +57,8 @@ class Runway:
             number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
             if not (number and 0 < value < _LONGEST_M):
                 raise InputError(f"runway {self.ident}: {name} is {value!r}; it must be > 0, in metres")
+        if not 0 <= self.displaced_m < _LONGEST_M:
+            raise InputError(f"runway {self.ident}: displaced_m is {self.displaced_m!r}; it must be >= 0, in metres")
         half = self.width_m / 2
         flat = [[0, half, 0], [0, -half, 0], [self.length_m, -half, 0], [self.length_m, half, 0]]
         given: ArrayLike = flat if self.corners is None else self.corners
@@ -71,7 +79,7 @@ class Runway:
         no nearer to the edges than the width allows. What is painted may differ: real markings stand
         at the visual slope indicator where there is one. Raises InputError for a runway too small.
         """
-        begin, width, space = next(row[1:] for row in _AIMING_POINT_M if self.length_m >= row[0])
+        begin, width, space = aiming_point_m(self.length_m)
         half = min(space / 2 + width, self.width_m / 2 - _MARGIN_M)
         if half <= space / 2 or begin + _STRIPE_LENGTH_M > self.length_m:
             raise InputError(
@@ -125,42 +133,187 @@ class Runway:
         return cls(length, width_m, ident, np.array(corners))
 
 
-def find_runway(ident: str, database: str | Path | None = None) -> Runway:
-    """The runway named "AIRPORT/DIRECTION" (e.g. "LFPO/24") in a LARD runway database (JSON).
+def aiming_point_m(landing_distance_m: float) -> tuple[float, float, float]:
+    """Where the aiming-point marking begins, its stripes' width, the space between, m (Annex 14, Table 5-1)."""
+    return next(row[1:] for row in _AIMING_POINT_M if landing_distance_m >= row[0])
 
-    The file is `database`, or the one the environment variable SHORTFINAL_RUNWAYS names. Raises
-    InputError, with the nearest names, if there is no such file or runway.
+
+def find_runway(
+    ident: str, database: str | Path | None = None, *, width_m: float | None = None, level: bool = False
+) -> Runway:
+    """The runway named "AIRPORT/DIRECTION", e.g. "LFPO/24", of a runway database.
+
+    `database` is LARD's JSON file, OurAirports' runways.csv, or the folder that holds it; without it
+    the environment variable SHORTFINAL_RUNWAYS names one. The airport is its ICAO code or, if
+    OurAirports' airports.csv lies beside, its IATA, GPS or local code. `width_m` and `level` say what
+    to take where the database gives no width or no elevation: this width, and no difference of
+    elevation. Raises InputError, naming the nearest, the choice or the field, if there is no such
+    file, no such runway, more than one, or too little known of it.
     """
     path = database or os.environ.get(DATABASE_VARIABLE)
     if not path:
         raise InputError(
-            f"runway {ident}: no runway database; pass its path or set {DATABASE_VARIABLE} to a LARD-style JSON file"
+            f"runway {ident}: no runway database; pass its path or set {DATABASE_VARIABLE} to LARD's JSON file, "
+            "OurAirports' runways.csv or its folder"
         )
-    return find_in_database(load_database(path), ident, str(path))
+    return load_database(path).find(ident, width_m=width_m, level=level)
 
 
-def load_database(path: str | Path) -> dict[str, Any]:
-    """The database file as it is: {airport: {direction: {A, B, C, D: ...}}}. Raises InputError."""
-    content = read_json(path, "runway database")
-    if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
-        raise InputError(f"{path}: expected {{airport: {{direction: corners}}}} as in LARD's database")
-    return content
+class Direction(Protocol):
+    """A landing direction as a database has it."""
+
+    @property
+    def place(self) -> str:
+        """Where it stands in the file."""
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is out of use."""
+
+    def runway(self, ident: str, width_m: float | None, level: bool) -> Runway:
+        """The runway; arguments as of `find_runway`. Raises InputError for an entry that gives none."""
 
 
-def find_in_database(database: dict[str, Any], ident: str, name: str = "database") -> Runway:
-    """One runway of a loaded database. LARD's C and D are the landing threshold, A and B the far end."""
-    airport, _, direction = ident.strip().upper().replace("-", "/").partition("/")
-    entry = database.get(airport, {}).get(direction) or database.get(airport, {}).get(direction.lstrip("0"))
-    if entry is None:
-        known = [f"{a}/{d}" for a, directions in database.items() for d in directions]
-        near = [k for k in known if k.startswith(airport + "/")] or difflib.get_close_matches(
-            f"{airport}/{direction}", known, n=3, cutoff=0.4
-        )
-        hint = f"; nearest: {', '.join(near[:6])}" if near else ""
-        raise InputError(f"{name}: unknown runway {ident!r} among {len(known)}{hint}")
+@dataclass(frozen=True, eq=False)
+class RunwayDatabase:
+    """Runways by airport and landing direction."""
+
+    name: str  # for messages
+    airports: Mapping[str, Mapping[str, Sequence[Direction]]]  # by code and direction, in capitals, "06" and not "6"
+    codes: Sequence[Mapping[str, Sequence[str]]] = ()  # airports by other codes, the first to be looked up first
+    titles: Mapping[str, str] = field(default_factory=dict)  # what airports are called
+
+    def find(self, ident: str, *, width_m: float | None = None, level: bool = False) -> Runway:
+        """As `find_runway`. A closed runway is given only if no open one has its name."""
+        code, direction = _parts(ident)
+        airport = self._airport(code, direction, ident)
+        there = self.airports[airport]
+        found = there.get(direction, ())
+        found = [d for d in found if not d.closed] or found
+        if len(found) == 1:
+            return found[0].runway(f"{airport}/{direction}", width_m, level)
+        if found:
+            places = " and ".join(d.place for d in found)
+            raise InputError(f"{self.name}: runway {ident!r} stands there more than once, {places}; remove all but one")
+        sides = [d for d in there if direction.isdigit() and re.fullmatch(rf"{direction}\D", d)]
+        if sides:
+            choice = " or ".join(f"{airport}/{d}" for d in sorted(sides))
+            raise InputError(f"{self.name}: runway {ident!r} is ambiguous; choose {choice}")
+        raise self._unknown(ident, [f"{airport}/{d}" for d in sorted(there)])
+
+    def _airport(self, code: str, direction: str, ident: str) -> str:
+        if code in self.airports:
+            return code
+        for kind in self.codes:
+            found = kind.get(code, ())
+            if len(found) == 1:
+                return found[0]
+            if found:
+                choice = " or ".join(f"{a}/{direction} ({self.titles.get(a, 'unnamed')})" for a in sorted(found))
+                raise InputError(f"{self.name}: runway {ident!r} is ambiguous; choose {choice}")
+        raise self._unknown(ident, self._nearest(code, direction))
+
+    def _nearest(self, code: str, direction: str) -> list[str]:
+        """Airports of similar code, and those called so."""
+        known = {key: found[0] for kind in reversed(self.codes) for key, found in kind.items()}
+        known |= {airport: airport for airport in self.airports}
+        unlike = {key: _unlike(code, key) for key in known}
+        least = min(unlike.values(), default=3)
+        close = {known[key] for key in known if unlike[key] == least <= 2}
+        # The first two letters of an ICAO code are the country's.
+        near = sorted(close, key=lambda a: (a[:2] != code[:2], direction not in self.airports[a], a))[:3]
+        called = [a for a, title in self.titles.items() if len(code) > 2 and code in title.upper()][:3]
+        names = []
+        for airport in dict.fromkeys(near + called):
+            title = self.titles.get(airport)
+            name = f"{airport}/{direction}" if direction in self.airports[airport] else airport
+            names.append(f"{name} ({title})" if title else name)
+        return names
+
+    def _unknown(self, ident: str, near: Sequence[str]) -> InputError:
+        return InputError(f"{self.name}: unknown runway {ident!r}" + (f"; nearest: {', '.join(near)}" if near else ""))
+
+
+def _unlike(a: str, b: str) -> int:
+    """How many characters differ, read from the left or from the right; a missing one counts too."""
+    differ = min(sum(map(operator.ne, a, b)), sum(map(operator.ne, reversed(a), reversed(b))))
+    return int(differ + abs(len(a) - len(b)))
+
+
+def load_database(path: str | Path) -> RunwayDatabase:
+    """A runway database: LARD's JSON, OurAirports' runways.csv, or a folder with it; told apart by content.
+
+    OurAirports' airports.csv is read too where it lies beside. A file is read once, until it changes.
+    Raises InputError for a file that is neither.
+    """
+    file = Path(path) / "runways.csv" if Path(path).is_dir() else Path(path)
+    beside = file.with_name("airports.csv")
+    return _load(file, beside if beside.is_file() and beside != file else None, _version(file), _version(beside))
+
+
+def _version(file: Path) -> tuple[int, int]:
+    """What tells a changed file."""
     try:
-        coordinates = [entry[corner]["coordinate"] for corner in "CDBA"]
-        corners = [[c["latitude"], c["longitude"], c["altitude"]] for c in coordinates]
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{name}: runway {ident}: no WGS84 coordinate for corner ({error})") from error
-    return Runway.from_corners_wgs84(corners, f"{airport}/{direction}")
+        status = file.stat()
+    except OSError:
+        return (0, 0)
+    return (status.st_mtime_ns, status.st_size)
+
+
+@functools.lru_cache(maxsize=8)
+def _load(file: Path, airports: Path | None, *_: tuple[int, int]) -> RunwayDatabase:
+    try:
+        with file.open("rb") as content:
+            begin = content.read(4096).removeprefix(b"\xef\xbb\xbf").lstrip()
+    except OSError as error:
+        raise InputError(f"{file}: cannot read the runway database: {error.strerror}") from error
+    if begin[:1] not in (b"{", b"["):
+        from shortfinal.airports import read_ourairports
+
+        return read_ourairports(file, airports)
+    return lard_database(read_json(file, "runway database"), str(file))
+
+
+def lard_database(content: Any, name: str) -> RunwayDatabase:
+    """A database of LARD's JSON: {airport: {direction: {A, B, C, D: {coordinate: ...}}}}. Raises InputError."""
+    if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
+        raise InputError(f"{name}: expected {{airport: {{direction: corners}}}} as in LARD's database")
+    airports: dict[str, dict[str, list[Direction]]] = {}
+    for airport, directions in content.items():
+        there = airports.setdefault(airport.upper(), {})
+        for direction, corners in directions.items():
+            entry = _LardDirection(name, f"as {airport}/{direction}", corners)
+            there.setdefault(direction_name(direction), []).append(entry)
+    return RunwayDatabase(name, airports)
+
+
+@dataclass(frozen=True, eq=False)
+class _LardDirection:
+    file: str
+    place: str
+    corners: Any
+    closed: bool = False
+
+    def runway(self, ident: str, width_m: float | None, level: bool) -> Runway:
+        """LARD's C and D are the landing threshold, A and B the far end; it leaves nothing out."""
+        try:
+            coordinates = [self.corners[corner]["coordinate"] for corner in "CDBA"]
+            corners = [[c["latitude"], c["longitude"], c["altitude"]] for c in coordinates]
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{self.file}: runway {ident}: no WGS84 coordinate for corner ({error})") from error
+        return Runway.from_corners_wgs84(corners, ident)
+
+
+@functools.lru_cache(maxsize=1024)
+def direction_name(text: str) -> str:
+    """A landing direction as databases are asked for it: in capitals, with two digits."""
+    name = text.strip().upper()
+    number = re.match(r"\d+", name)
+    return name if number is None else number[0].lstrip("0").zfill(2) + name[number.end() :]
+
+
+def _parts(ident: str) -> tuple[str, str]:
+    """Airport and direction of "LFPO/24" or "LFPO-24". Codes such as "FR-0123" have a dash of their own."""
+    name = ident.strip().upper()
+    airport, _, direction = name.partition("/") if "/" in name else name.rpartition("-")
+    return airport.strip() or name, direction_name(direction) if airport else ""

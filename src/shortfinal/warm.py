@@ -57,6 +57,6 @@ def _protect() -> None:
 
 
 def _render() -> None:
-    from shortfinal.data.scene import random_scene, render
+    from shortfinal.scene.render import random_scene, render
 
     render(random_scene(np.random.default_rng(0), _RUNWAY), _CAMERA, _POSE)

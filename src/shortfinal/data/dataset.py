@@ -1,41 +1,46 @@
-"""Rendered data sets: random approaches, drawn around the runway, with exact labels.
+"""Rendered data sets: random approaches with exact labels, as views of the runway or as a camera's whole frames.
 
-On disk: `images/000000.png`, ... and `labels.csv`, one row a picture. Every row follows from the
-seed and its number alone, so an interrupted run continues where it stopped.
+On disk: `images/000000.png`, ... and `labels.csv`, one row a picture; beside whole frames the
+same in LARD's form. Every row follows from the seed and its number alone, so an interrupted run
+continues where it stopped.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from shortfinal.crops import bogo_crop, box_around
-from shortfinal.data.lard import NAUTICAL_MILE_M
-from shortfinal.data.scene import Scene, Sensor, random_scene, random_sensor, render
+from shortfinal.data.image import Image, read_image
+from shortfinal.data.lard import NAUTICAL_MILE_M, NewLabel, write_database, write_labels
 from shortfinal.data.table import read_table
 from shortfinal.errors import InputError
 from shortfinal.files import csv_text, make_folder, write_png, write_whole
-from shortfinal.geometry import Camera, Pose, project
+from shortfinal.geometry import Camera, Pose, can_project, project, unproject
 from shortfinal.runway import Runway
+from shortfinal.scene.render import Scene, random_scene, render
+from shortfinal.scene.sensor import Sensor, random_sensor
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 COLUMNS = (
-    "image", "width", "height", "fx", "fy", "cx", "cy", "length_m", "width_m",
+    "image", "ident", "width", "height", "fx", "fy", "cx", "cy", "distortion", "length_m", "width_m",
     "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg",
     "near_left_u", "near_left_v", "near_right_u", "near_right_v",
     "far_right_u", "far_right_v", "far_left_u", "far_left_v",
 )  # fmt: skip
 _CORNER_COLUMNS = COLUMNS[-8:]
+_TRIES, _BORDER_PX = 50, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,13 +51,15 @@ class Example:
     corners_px: Array  # (4, 2), keypoint order
 
 
-def random_approach(rng: np.random.Generator) -> Pose:
+def random_approach(rng: np.random.Generator, visibility_m: float = math.inf) -> Pose:
     """A camera in LARD's approach cone, somewhat widened (LARD, Ducoffe et al. 2023, table 1).
 
     Slant distance 0.05 to 4.5 NM, log-uniform; glide angle 1.8 to 4.5 degrees at an apex 305 m past
-    the threshold; 5 degrees to either side; yaw, roll 12 degrees to either side, pitch -9 to 1.
+    the threshold; 5 degrees to either side; yaw, roll 12 degrees to either side, pitch -9 to 1. No farther out than
+    0.7 of the visibility, where 6 % of the contrast is left.
     """
-    distance = float(np.exp(rng.uniform(np.log(0.05), np.log(4.5)))) * NAUTICAL_MILE_M
+    farthest = min(4.5, 0.7 * visibility_m / NAUTICAL_MILE_M)
+    distance = float(np.exp(rng.uniform(np.log(0.05), np.log(farthest)))) * NAUTICAL_MILE_M
     lateral, glide = np.radians([rng.uniform(-5, 5), rng.uniform(1.8, 4.5)])
     height = (distance + 305.0) * np.tan(glide)
     attitude = rng.uniform([-12, -9, -12], [12, 1, 12])
@@ -63,12 +70,17 @@ def random_approach(rng: np.random.Generator) -> Pose:
 class Shot:
     """A picture about to be taken."""
 
+    ident: str  # of the airfield and its landing direction; each picture has its own
     scene: Scene
-    runway: Runway
     camera: Camera  # of the picture
     pose: Pose
     sensor: Sensor
     noise_seed: int
+
+    @property
+    def runway(self) -> Runway:
+        """The scene's, flat."""
+        return Runway(self.scene.airfield.length, self.scene.airfield.width, self.ident)
 
     @property
     def corners_px(self) -> Array:
@@ -83,29 +95,70 @@ class Shot:
     def row(self, name: str) -> dict[str, str]:
         """Its line in labels.csv, to nine digits."""
         c, r = self.camera, self.runway
-        numbers = [c.width, c.height, c.fx, c.fy, c.cx, c.cy, r.length_m, r.width_m]
-        numbers += [*self.pose.position_m, *self.pose.attitude, *self.corners_px.ravel()]
-        return dict(zip(COLUMNS, [name, *(f"{n:.9g}" for n in numbers)], strict=True))
+        lens = " ".join(f"{k:.9g}" for k in c.distortion)
+        numbers = [r.length_m, r.width_m, *self.pose.position_m, *self.pose.attitude, *self.corners_px.ravel()]
+        cells = [name, r.ident, c.width, c.height, *(f"{n:.12g}" for n in (c.fx, c.fy, c.cx, c.cy)), lens]
+        return dict(zip(COLUMNS, [*map(str, cells), *(f"{n:.9g}" for n in numbers)], strict=True))
 
 
-def plan_shot(seed: int, index: int) -> Shot:
+def plan_shot(seed: int, index: int, camera: Camera | None = None) -> Shot:
     """Picture number `index` of the data set `seed`.
 
-    The runway's box is 11 to 200 pixels long (log-uniform), as a camera sees it from afar or near; the
-    picture holds it with room for the training crop to move.
+    With a camera: the whole frame it takes, the runway inside. Without: a view around the runway,
+    whose box is 11 to 200 pixels long (log-uniform), as a camera sees it from afar or near; with
+    room for the training crop to move. Raises InputError for a camera that cannot hold a runway.
     """
     rng = np.random.default_rng([seed, index])
     scene = random_scene(rng)
-    runway = Runway(scene.length, scene.width)
-    pose = random_approach(rng)
-    unit = Camera(1, 1, 1000.0, 1000.0 * rng.uniform(0.9, 1.1), 0.0, 0.0)
+    runway = Runway(scene.airfield.length, scene.airfield.width)
+    if camera is None:
+        pose = random_approach(rng, scene.sky.visibility_m)
+        camera = _view(runway, pose, rng)
+    else:
+        pose = _framed_approach(scene, runway, camera, rng)
+    ident = f"S{seed}N{index:06d}/{scene.airfield.designator:02d}"
+    return Shot(ident, scene, camera, pose, random_sensor(rng), int(rng.integers(2**31)))
+
+
+def _view(runway: Runway, pose: Pose, rng: np.random.Generator) -> Camera:
+    """A camera that sees the runway's surroundings only; its lens may distort."""
+    lens = (rng.normal(0, 0.15), rng.normal(0, 0.05), 0.0, 0.0) if rng.random() < 0.2 else ()
+    unit = Camera(1, 1, 1000.0, 1000.0 * rng.uniform(0.9, 1.1), 0.0, 0.0, lens)
     box = box_around(project(unit, pose, runway.corners))
     side = float(np.exp(rng.uniform(np.log(11.0), np.log(200.0))))
     zoom = side / float((box[2:] - box[:2]).max())
-    camera = Camera(1, 1, unit.fx * zoom, unit.fy * zoom, 0.0, 0.0)
+    camera = Camera(1, 1, unit.fx * zoom, unit.fy * zoom, 0.0, 0.0, lens)
     out = int(np.ceil(max(1.3 * side, min(1.9 * side, 235.0)))) + 2
     window = bogo_crop(box_around(project(camera, pose, runway.corners)), out / side, out, rng, slack=0.06)
-    return Shot(scene, runway, camera.view(window), pose, random_sensor(rng), int(rng.integers(2**31)))
+    return camera.view(window)
+
+
+def _framed_approach(scene: Scene, runway: Runway, camera: Camera, rng: np.random.Generator) -> Pose:
+    """A random approach, the camera turned no more than it needs for the runway to lie in the frame."""
+    for _ in range(_TRIES):
+        pose = random_approach(rng, scene.sky.visibility_m)
+        for _ in range(4):  # turning changes the outline a little
+            if not can_project(camera, pose, runway.corners).all():
+                break
+            box = box_around(project(camera, pose, runway.corners))
+            inside = np.array([camera.width, camera.height]) - 1 - _BORDER_PX
+            shift = np.maximum(_BORDER_PX - box[:2], 0) - np.maximum(box[2:] - inside, 0)
+            if (box[2:] - box[:2] > inside - _BORDER_PX).any():
+                break
+            if not shift.any():
+                return pose
+            pose = _turned(pose, camera, (box[:2] + box[2:]) / 2, shift * 1.02)
+    raise InputError(
+        f"camera: {camera.width} x {camera.height} with fx {camera.fx:g}: no runway of {runway.length_m:.0f} m fits "
+        f"into its frame in {_TRIES} approaches; take a wider lens"
+    )
+
+
+def _turned(pose: Pose, camera: Camera, px: Array, shift: Array) -> Pose:
+    """The pose turned about the camera so that what is seen at `px` moves by `shift` pixels."""
+    seen, wanted = unproject(camera, np.array([px, px + shift]))
+    turn = Rotation.align_vectors(wanted[None], seen[None])[0].as_matrix()
+    return Pose(pose.position_m, pose.runway_from_camera @ turn.T)
 
 
 def write_dataset(
@@ -114,34 +167,40 @@ def write_dataset(
     seed: int = 0,
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
+    camera: Camera | None = None,
 ) -> Path:
     """Render `count` pictures into the folder `out`; those already there are kept.
 
-    Returns the path of labels.csv, which appears when all are done. Raises InputError if the folder
-    holds a data set of another seed.
+    `camera`: whole frames as it takes them, else views around the runway (`plan_shot`). Returns the
+    path of labels.csv, which appears when all are done; beside whole frames also lard.csv and
+    runways.json, the same in LARD's form, for tools that read that.
+    Raises InputError if the folder holds a data set of another seed or camera.
     """
     folder = Path(out)
     make_folder(folder / "images")
-    _claim(folder / "dataset.json", seed)
+    _claim(folder / "dataset.json", {"seed": seed, "camera": None if camera is None else asdict(camera)})
 
-    def one(index: int) -> dict[str, str]:
+    def one(index: int) -> tuple[dict[str, str], NewLabel, Runway]:
         name = f"images/{index:06d}.png"
-        shot = plan_shot(seed, index)
+        shot = plan_shot(seed, index, camera)
         if not _is_whole_png(folder / name):
             write_png(folder / name, shot.render().image)
         if progress:
             progress(index)
-        return shot.row(name)
+        return shot.row(name), NewLabel(name, shot.camera, shot.ident, shot.pose, shot.corners_px), shot.runway
 
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
-        rows = list(pool.map(one, range(count)))
+        rows, labels, runways = zip(*pool.map(one, range(count)), strict=True)
+    if camera is not None:  # LARD's whole pixels say too little of a small view
+        write_labels(folder / "lard.csv", labels)
+        write_database(folder / "runways.json", runways)
     write_whole(folder / "labels.csv", csv_text(COLUMNS, rows))
     return folder / "labels.csv"
 
 
-def _claim(stamp: Path, seed: int) -> None:
-    """Note the seed in the folder, or refuse a folder of another seed."""
-    text = json.dumps({"seed": seed})
+def _claim(stamp: Path, made_by: dict[str, Any]) -> None:
+    """Note in the folder what its pictures follow from, or refuse a folder of other pictures."""
+    text = json.dumps(made_by)
     try:
         there = stamp.read_text(encoding="utf-8") if stamp.exists() else text
     except OSError as error:
@@ -149,7 +208,9 @@ def _claim(stamp: Path, seed: int) -> None:
     except UnicodeDecodeError as error:
         raise InputError(f"{stamp}: not a text file; choose an empty folder") from error
     if there != text:
-        raise InputError(f"{stamp.parent}: holds a data set of another seed; choose an empty folder or the same --seed")
+        raise InputError(
+            f"{stamp.parent}: holds a data set of another seed or camera; choose an empty folder or the same ones"
+        )
     write_whole(stamp, text)
 
 
@@ -197,27 +258,3 @@ def read_dataset(folder: str | Path) -> RenderedDataset:
         if not os.path.isfile(picture):
             raise InputError(f"{path}: line {row.line}: {picture}: no such image")
     return RenderedDataset(path.parent, [row.get("image") for row in rows], corners)
-
-
-def read_image(path: str | Path) -> Image:
-    """An image file as RGB (h, w, 3) uint8, as stored: labels are in stored pixels, so EXIF does not turn it.
-
-    Raises InputError if it is missing, no image, or cut off.
-    """
-    path = Path(path)
-    if not path.exists():
-        raise InputError(f"{path}: no such image")
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read as an image: {error.strerror}") from error
-    # libjpeg fills what is missing with grey. Some cameras pad behind the end marker.
-    if content.startswith(b"\xff\xd8") and b"\xff\xd9" not in content.rstrip(b"\0")[-64:]:
-        raise InputError(f"{path}: truncated JPEG")
-    try:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:  # of an empty file, or one that claims too large a picture
-        image = None
-    if image is None:
-        raise InputError(f"{path}: cannot be read as an image")
-    return np.ascontiguousarray(image[..., ::-1])

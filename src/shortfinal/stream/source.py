@@ -6,18 +6,17 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shortfinal.crops import box_around
-from shortfinal.data.dataset import read_image
+from shortfinal.data.image import read_image
 from shortfinal.data.lard import labels_of
-from shortfinal.data.table import Row, read_table
+from shortfinal.data.table import Refusal, Row, read_table
 from shortfinal.errors import InputError
 from shortfinal.geometry import Camera, PixelWindow
-from shortfinal.runway import Runway, find_in_database, load_database
+from shortfinal.runway import Runway, RunwayDatabase, load_database
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -43,7 +42,8 @@ class LabelledFolder:
 
     `labels` has LARD's columns (v1 or v2), or image, left, top, right, bottom (pixels of the image).
     The runway is each row's own, looked up in `database`, unless one is given; the camera is the one
-    that LARD's labels imply, scaled to the stored image, unless one is given.
+    that LARD's labels imply, scaled to the stored image, unless one is given. Rows that are no labels
+    are left out, and listed in `refused`.
     """
 
     def __init__(
@@ -60,9 +60,10 @@ class LabelledFolder:
         if not self.folder.is_dir():
             raise InputError(f"{folder}: no such folder of images")
         self._camera, self._runway = camera, runway
-        self._database: tuple[dict[str, Any], str] | None = None
+        self._database: RunwayDatabase | None = None
         if database is not None:
-            self._database = (load_database(database), str(database))
+            self._database = load_database(database)
+        self.refused: tuple[Refusal, ...] = ()
         self._rows = self._read()
 
     def __len__(self) -> int:
@@ -77,8 +78,9 @@ class LabelledFolder:
             if not table.records:
                 raise InputError(f"{self.labels}: a header without rows; expected one box per line")
             return [self._boxed(row) for row in table.rows()]
-        rows = []
-        for label in labels_of(table):
+        rows, labels = [], labels_of(table)
+        self.refused = labels.refused
+        for label in labels:
             where = f"{self.labels}: line {label.line}"
             if self._camera is None and label.camera is None:
                 raise InputError(f"{where}: these labels do not say which camera took the picture; pass --camera")
@@ -121,7 +123,7 @@ class LabelledFolder:
         if self._database is None:
             raise InputError(f"{where}: runway {ident} needs a database; pass --runways")
         try:
-            return find_in_database(self._database[0], ident, self._database[1])
+            return self._database.find(ident)
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
 

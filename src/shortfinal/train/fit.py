@@ -9,11 +9,9 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from lightning.fabric import Fabric
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
@@ -21,12 +19,12 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.data import DataLoader, Dataset
 
 from shortfinal.calibration import coverage
-from shortfinal.crops import bogo_crop, box_around, centre_crop
-from shortfinal.data.dataset import Example, read_dataset
+from shortfinal.crops import box_around, centre_crop
+from shortfinal.data.augment import augmented_crop
+from shortfinal.data.dataset import read_dataset
 from shortfinal.detector import crop_image, normalise
 from shortfinal.errors import InputError, JobError
 from shortfinal.files import csv_text, make_folder, write_whole
-from shortfinal.geometry import PixelWindow
 from shortfinal.train.model import KeypointNet, gaussian_nll, to_pixels, variance_px
 
 Batch = tuple[Tensor, Tensor]
@@ -44,7 +42,7 @@ class Recipe:
     backbone: str = "mobilenetv3_small_100"  # any timm model with features_only
     width: int = 96  # channels of the head
     size: int = 224  # side of the crop, px
-    margin: float = 1.4  # of the evaluation crop; training draws from 1.15 to 1.9
+    margin: float = 1.4  # of the evaluation crop; training draws its own (crops.random_margin)
     batch: int = 32
     steps: int = 10000
     warm_up: float = 0.1  # share of the steps before the variance enters the mean's loss
@@ -55,45 +53,6 @@ class Recipe:
     validation_count: int = 1000
     workers: int = 1
     seed: int = 0
-
-
-def augment(crop: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Photometric changes only: they leave the labels as they are."""
-    gamma = np.exp(rng.normal(0, 0.2))
-    gain, offset = np.exp(rng.normal(0, 0.15, 3) * 0.5 + rng.normal(0, 0.15)), rng.normal(0, 8)
-    levels = (np.arange(256) / 255.0) ** gamma
-    table = np.clip(255 * levels[:, None] * gain + offset, 0, 255).astype(np.uint8)
-    crop = np.asarray(cv2.LUT(crop, table[None]), np.uint8)
-    if rng.random() < 0.3:  # towards grey, or with the channels mixed
-        mix = rng.uniform(0, 1) * rng.dirichlet([1, 1, 1], 3)
-        mix += np.diag(1 - mix.sum(axis=1))
-        crop = np.asarray(cv2.transform(crop, mix), np.uint8)
-    if rng.random() < 0.2:
-        crop = np.asarray(cv2.GaussianBlur(crop, (0, 0), rng.uniform(0.5, 2.0)), np.uint8)
-    if rng.random() < 0.2:
-        grain = rng.normal(0, rng.uniform(1, 8), crop.shape)
-        crop = np.clip(crop + grain, 0, 255).astype(np.uint8)
-    return crop
-
-
-def training_crop(
-    example: Example, size: int, rng: np.random.Generator
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """A random crop (size, size, 3) of an example, and its corners (4, 2); half of them mirrored."""
-    height, width = example.image.shape[:2]
-    box = box_around(example.corners_px)
-    side = (box[2:] - box[:2]).max()
-    margin = rng.uniform(1.15, max(1.2, min(1.9, min(width, height) / side)))
-    window = bogo_crop(box, margin, size, rng, slack=0.02)
-    if rng.random() < 0.95:  # else the crop may hang over the image's border
-        left = float(np.clip(window.left, 0, max(0.0, width - window.width)))
-        top = float(np.clip(window.top, 0, max(0.0, height - window.height)))
-        window = PixelWindow(left, top, window.width, window.height, size, size)
-    crop, corners = crop_image(example.image, window), window.apply(example.corners_px)
-    if rng.random() < 0.5:
-        crop = np.ascontiguousarray(crop[:, ::-1])
-        corners = (corners * [-1, 1] + [size - 1, 0])[[1, 0, 3, 2]]  # left and right change places
-    return crop, corners
 
 
 class _Draws(Dataset[Batch]):
@@ -108,8 +67,9 @@ class _Draws(Dataset[Batch]):
 
     def __getitem__(self, index: int) -> Batch:
         rng = np.random.default_rng([self.recipe.seed, 1, self.start + index])
-        crop, corners = training_crop(self.examples[int(rng.integers(len(self.examples)))], self.recipe.size, rng)
-        image = normalise(augment(crop, rng), MEAN, STD)
+        example = self.examples[int(rng.integers(len(self.examples)))]
+        crop, corners = augmented_crop(example, self.recipe.size, rng)
+        image = normalise(crop, MEAN, STD)
         return torch.from_numpy(image), torch.from_numpy(corners.astype(np.float32))
 
 

@@ -1,0 +1,244 @@
+"""Training crops that differ each time, with labels that stay true.
+
+Geometry (crop, small rotation, mirror) is one affine map, applied to picture and corners alike. The
+camera's effects are a weak random `Sensor`. What happens on the way to the lens (haze, drops, glare,
+dirt, night) is drawn on the crop by EFFECTS; none of it moves a corner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from shortfinal.crops import bogo_crop, box_around, random_margin
+from shortfinal.data.dataset import Example
+from shortfinal.detector import warp_image
+from shortfinal.geometry import PixelWindow
+from shortfinal.scene.sensor import expose, random_sensor, to_8_bit
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Light = NDArray[np.float32]
+
+MIRRORED, ROTATED, OVERHANGING = 0.5, 0.3, 0.05  # probabilities
+SENSOR_RATE = 0.4  # of random_sensor's effects: the pictures have been through one already
+_MOST_TURN_DEG = 7.0
+_CLEAR_PX = 6.0  # a drop stays this far from the corners before it may bend the picture
+
+
+@dataclass(frozen=True, eq=False)
+class Warp:
+    """An affine map from an image to a square crop."""
+
+    crop_from_image: Array  # (2, 3): pixel (u, v, 1) of the image to (u, v) of the crop
+    size: int  # side of the crop, px
+    mirrored: bool = False  # then left and right change names
+    border: int = cv2.BORDER_CONSTANT  # OpenCV's, beyond the image: black
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the crop per pixel of the image."""
+        return float(np.sqrt(abs(np.linalg.det(self.crop_from_image[:, :2]))))
+
+    @property
+    def image_from_crop(self) -> Array:
+        """The inverse map (2, 3)."""
+        return np.linalg.inv(np.vstack([self.crop_from_image, [0, 0, 1]]))[:2]
+
+    def cut(self, image: Image) -> Image:
+        """The crop (size, size, 3), resampled once; area-averaged where it shrinks."""
+        return warp_image(image, self.image_from_crop, (self.size, self.size), self.border)
+
+    def apply(self, corners_px: ArrayLike) -> Array:
+        """The image's corners (4, 2), keypoint order, as the crop's, in keypoint order again."""
+        moved = np.asarray(corners_px, float) @ self.crop_from_image[:, :2].T + self.crop_from_image[:, 2]
+        return moved[[1, 0, 3, 2]] if self.mirrored else moved
+
+    def region(self, image: Image) -> tuple[Image, Warp]:
+        """The part of the image that the crop shows, and the map from there."""
+        ends = np.array([[-1, -1, 1], [self.size, -1, 1], [-1, self.size, 1], [self.size, self.size, 1]])
+        reach = ends @ self.image_from_crop.T
+        height, width = image.shape[:2]
+        left, top = np.clip(np.floor(reach.min(axis=0)) - 2, 0, [width - 1, height - 1]).astype(int)
+        right, bottom = np.clip(np.ceil(reach.max(axis=0)) + 3, [left + 1, top + 1], [width, height]).astype(int)
+        matrix = self.crop_from_image.copy()
+        matrix[:, 2] += matrix[:, :2] @ [left, top]
+        return image[top:bottom, left:right], Warp(matrix, self.size, self.mirrored, self.border)
+
+
+def random_warp(corners_px: Array, image_size: tuple[int, int], size: int, rng: np.random.Generator) -> Warp:
+    """Where a training crop lies: a Bogo crop of random scale, some turned by a few degrees, half of them mirrored.
+
+    Most lie within the image (width, height); few hang over its border, and turned ones may.
+    """
+    box = box_around(corners_px)
+    turn_deg, border = 0.0, cv2.BORDER_CONSTANT
+    if rng.random() < ROTATED:
+        turn_deg = rng.uniform(-_MOST_TURN_DEG, _MOST_TURN_DEG)
+        # Not reflected: the mirror image of a runway's end is another end.
+        border = cv2.BORDER_REPLICATE if rng.random() < 0.5 else cv2.BORDER_CONSTANT
+    centre = (box[:2] + box[2:]) / 2
+    turn = _turn(centre, turn_deg)
+    turned = corners_px @ turn[:, :2].T + turn[:, 2]
+    box = box_around(turned)
+    within = None if rng.random() < OVERHANGING else image_size
+    window = bogo_crop(box, random_margin(box, image_size, rng), size, rng, slack=0.02, image_size=within)
+    matrix = _matrix(window) @ np.vstack([turn, [0, 0, 1]])
+    mirrored = bool(rng.random() < MIRRORED)
+    if mirrored:
+        matrix[0] = [0, 0, size - 1] - matrix[0]
+    return Warp(matrix, size, mirrored, border)
+
+
+def training_crop(example: Example, size: int, rng: np.random.Generator) -> tuple[Image, Array]:
+    """A random crop (size, size, 3) of an example, and its corners (4, 2). Geometry only."""
+    height, width = example.image.shape[:2]
+    warp = random_warp(example.corners_px, (width, height), size, rng)
+    return warp.cut(example.image), warp.apply(example.corners_px)
+
+
+def augmented_crop(example: Example, size: int, rng: np.random.Generator) -> tuple[Image, Array]:
+    """A random crop (size, size, 3) of an example as another camera in other weather saw it; its corners (4, 2).
+
+    The camera works at the image's resolution, or the crop's where that is coarser: its noise and its
+    JPEG blocks are enlarged with the picture, as in use.
+    """
+    height, width = example.image.shape[:2]
+    warp = random_warp(example.corners_px, (width, height), size, rng)
+    sensor = random_sensor(rng, SENSOR_RATE)
+    if warp.scale > 1:
+        part, moved = warp.region(example.image)
+        crop = moved.cut(expose(part.astype(np.float32), sensor, rng))
+    else:
+        crop = expose(warp.cut(example.image).astype(np.float32), sensor, rng)
+    corners = warp.apply(example.corners_px)
+    for effect in EFFECTS:
+        if rng.random() < effect.probability:
+            crop = effect.apply(crop, corners, rng)
+    return crop, corners
+
+
+def haze(crop: Image, corners: Array, rng: np.random.Generator) -> Image:
+    """A pale veil over the picture, denser towards the top, where the ground is far."""
+    colour = rng.uniform(140, 235) * np.exp(rng.normal(0, [0.04, 0.02, 0.04]))
+    dense = rng.uniform(0.1, 0.75)
+    thin = dense * rng.uniform(0.2, 1.0)
+    veil = np.linspace(dense, thin, len(crop), dtype=np.float32)[:, None, None]
+    return to_8_bit(crop + (colour.astype(np.float32) - crop) * veil)
+
+
+def glare(crop: Image, corners: Array, rng: np.random.Generator) -> Image:
+    """The sun in the lens: a veil around a point, and a streak through it."""
+    size = len(crop)
+    v, u = (np.linspace(0, 1, 28, dtype=np.float32) - np.float32(place) for place in rng.uniform(-0.3, 1.3, 2))
+    distance = u**2 + v[:, None] ** 2
+    angle = rng.uniform(0, np.pi)
+    off = (np.cos(angle) * u + np.sin(angle) * v[:, None]) ** 2
+    light = rng.uniform(0.1, 0.7) / (1 + distance / rng.uniform(0.01, 0.15)) + rng.uniform(0.0, 0.12)
+    light += rng.uniform(0.0, 0.35) * np.exp(-off / rng.uniform(0.001, 0.01)) / (1 + 2 * distance)
+    added = np.asarray(cv2.resize(light.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC), np.float32)
+    colour = np.array([255.0, rng.uniform(225, 255), rng.uniform(190, 255)], np.float32)
+    return to_8_bit(crop + (colour - np.float32(0.5) * crop) * added.clip(0, 1)[..., None])
+
+
+def drops(crop: Image, corners: Array, rng: np.random.Generator) -> Image:
+    """Rain on the lens: out-of-focus drops. Away from the corners they show the picture upside down, as lenses do."""
+    size = len(crop)
+    out = crop.copy()
+    for _ in range(rng.integers(1, 9)):
+        radius = float(np.exp(rng.uniform(np.log(3), np.log(0.12 * size))))
+        centre = rng.uniform(0, size, 2)
+        reach = int(radius) + 1
+        left, top = np.maximum(0, centre.astype(int) - reach)
+        right, bottom = np.minimum(size, centre.astype(int) + reach + 1)
+        part = crop[top:bottom, left:right]
+        bent = np.linalg.norm(corners - centre, axis=1).min() > radius + _CLEAR_PX
+        behind, blur = (part[::-1, ::-1], 0.3 * radius) if bent else (part, 0.8)
+        seen = np.asarray(cv2.GaussianBlur(behind, (0, 0), blur), np.float32)
+        v, u = np.mgrid[top:bottom, left:right].astype(np.float32)
+        away = np.hypot(u - centre[0], v - centre[1]) / np.float32(radius)
+        cover = ((1.0 - away) * 4).clip(0, 1)[..., None]
+        shade = 1 + bent * rng.uniform(0, 0.25) * (v - np.float32(centre[1])) / np.float32(radius)  # brighter below
+        mixed = part + (shade[..., None] * seen - part) * cover
+        out[top:bottom, left:right] = to_8_bit(np.asarray(mixed, np.float32))
+    return out
+
+
+def occlusion(crop: Image, corners: Array, rng: np.random.Generator) -> Image:
+    """Something on the window: a wiper, dirt, an insect. At most two corners are hidden; they stay labelled."""
+    size = len(crop)
+    hidden = np.zeros(len(corners), bool)
+    for _ in range(rng.integers(1, 4)):
+        mask = _patch(size, rng)
+        u, v = np.round(corners).astype(int).clip(0, size - 1).T
+        now = hidden | (mask[v, u] > 64)
+        if now.sum() > 2:
+            continue
+        hidden = now
+        colour = rng.uniform(5, 110) * np.exp(rng.normal(0, 0.08, 3))
+        cover = mask.astype(np.float32)[..., None] * np.float32(rng.uniform(0.6, 1.0) / 255)
+        mixed = crop + (colour.astype(np.float32) - crop) * cover
+        crop = to_8_bit(np.asarray(mixed, np.float32))
+    return crop
+
+
+def night(crop: Image, corners: Array, rng: np.random.Generator) -> Image:
+    """Dusk to night: the ground dark, bright points kept, noise."""
+    level = np.arange(256, dtype=np.float32) / 255
+    exposure = min(0.7, rng.uniform(15, 60) / max(1.0, float(crop.mean())))  # what the camera makes of the dark
+    dark = exposure * np.array([rng.uniform(0.75, 1.0), rng.uniform(0.85, 1.0), 1.0])
+    bright = 1 / (1 + np.exp(-(level - rng.uniform(0.75, 0.95)) / 0.04))[:, None]
+    table = 255 * (level[:, None] * dark * (1 - bright) + level[:, None] * bright)
+    lit = cv2.LUT(crop, table[None].astype(np.uint8))
+    noise = rng.standard_normal(crop.shape, dtype=np.float32)
+    return to_8_bit(lit + noise * np.float32(rng.uniform(0.5, 5.0)))
+
+
+class Effect(NamedTuple):
+    """Something between the world and the lens."""
+
+    apply: Callable[[Image, Array, np.random.Generator], Image]  # crop (h, w, 3), corners (4, 2), rng -> crop
+    probability: float
+
+
+EFFECTS = (
+    Effect(haze, 0.12),
+    Effect(night, 0.05),
+    Effect(glare, 0.08),
+    Effect(drops, 0.06),
+    Effect(occlusion, 0.08),
+)
+
+
+def _turn(centre: Array, degrees: float) -> Array:
+    """Rotation about a pixel (2, 3), from u towards v."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    rotation = np.array([[c, -s], [s, c]])
+    return np.column_stack([rotation, centre - rotation @ centre])
+
+
+def _matrix(window: PixelWindow) -> Array:
+    """PixelWindow.apply as a matrix (2, 3)."""
+    origin = window.apply([0.0, 0.0])
+    return np.column_stack([np.diag(window.scale), origin])
+
+
+def _patch(size: int, rng: np.random.Generator) -> Image:
+    """Where something covers a crop (size, size): 255 where it does, soft at its edge."""
+    mask = np.zeros((size, size), np.uint8)
+    if rng.random() < 0.3:  # a wiper across
+        ends = rng.uniform(0, size, 2)
+        line = np.round([[-5, ends[0]], [size + 5, ends[1]]]).astype(np.int32)
+        thick = int(rng.integers(3, max(4, size // 14)))
+        cv2.polylines(mask, [line[:, ::-1] if rng.random() < 0.5 else line], False, 255, thick, cv2.LINE_AA)
+    else:  # a spot
+        turn = np.linspace(0, 2 * np.pi, 10, endpoint=False)
+        radius = np.exp(rng.uniform(np.log(2), np.log(0.1 * size))) * rng.uniform(0.5, 1.3, 10)
+        outline = rng.uniform(0, size, 2) + radius[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+        cv2.fillPoly(mask, [np.round(outline * 16).astype(np.int32)], 255, cv2.LINE_AA, 4)
+    return np.asarray(cv2.GaussianBlur(mask, (0, 0), rng.uniform(0.6, 4.0)), np.uint8)
