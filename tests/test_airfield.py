@@ -130,6 +130,13 @@ def test_away_is_the_distance_from_the_grounds():
     out = np.empty(5)
     _away(record(field), points, out)
     np.testing.assert_allclose(out, [0, 50, 50, 0, 100])
+    crossing = field._replace(other=np.array([1000.0, -1500.0, 0.0, 1.0, 3000.0, 30.0]))
+    _away(
+        record(crossing),
+        np.array([[1000.0, 900.0], [1000.0, -1600.0], [1150.0, 900.0], [-230.0, 140.0], [0, 0.0]]),
+        out,
+    )
+    np.testing.assert_allclose(out, [0, 40, 60, 50, 0])
 
 
 @pytest.mark.parametrize(("angle", "white"), [(2.3, 0), (2.7, 1), (3.0, 2), (3.3, 3), (3.7, 4)])

@@ -1,6 +1,7 @@
 """Wrong input is one line that names what is wrong, exit status 2, and nothing half-written."""
 
 import json
+import shutil
 import sys
 
 import cv2
@@ -10,6 +11,8 @@ import pytest
 import shortfinal as sf
 from shortfinal.cli import main
 from shortfinal.crops import box_around
+from shortfinal.data.dataset import read_dataset
+from shortfinal.data.formats import open_dataset
 from shortfinal.demo import CAMERA, RUNWAY, approach_pose, demo_scene, render_frame
 
 CORNERS = sf.project(CAMERA, approach_pose(60), RUNWAY.corners)
@@ -292,3 +295,87 @@ def test_an_option_that_does_not_exist(capsys):
     assert "--speed" in refused(capsys, "demo", "--speed", "3")
     assert "COUNT" in refused(capsys, "data", "render").upper()
     assert call(capsys, "--help")[0] == 0
+
+
+LENS = "width = 96\nheight = 96\nfx = 133.4\nfy = 123.3\ncx = 47.5\ncy = 47.5\ndistortion = [-0.1, 0.02, 0.0, 0.0]\n"
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """Four whole frames with their labels, by the command."""
+    folder = tmp_path_factory.mktemp("frames")
+    (folder / "lens.toml").write_text(LENS)
+    with pytest.MonkeyPatch.context() as patch:
+        command = [
+            "data",
+            "render",
+            "--count",
+            "4",
+            "--seed",
+            "6",
+            "--camera",
+            folder / "lens.toml",
+            "--out",
+            folder / "set",
+        ]
+        patch.setattr(sys, "argv", ["shortfinal", *map(str, command)])
+        with pytest.raises(SystemExit):
+            main()
+    return folder / "set"
+
+
+def test_rendered_frames_are_fit_to_train_on(frames, tmp_path, capsys):
+    status, out, err = call(capsys, "data", "check", frames, "--out", tmp_path, "--json")
+    report = json.loads(out)
+    assert status == 0, err
+    assert report["pictures"] == report["labels"] == 4
+    written = {p.name for p in tmp_path.iterdir()}
+    assert written == {"check.json", "problems.csv", "check.png", "contact_sheet.png"}
+
+
+def test_a_data_set_with_problems_ends_with_1(frames, tmp_path, capsys):
+    broken = tmp_path / "set"
+    shutil.copytree(frames, broken)
+    (broken / "images" / "000002.png").write_bytes(b"not a picture")
+    status, _, err = call(capsys, "data", "check", broken, "--out", tmp_path / "out", "--json")
+    assert status == 1
+    assert "1 image" in err
+    assert "000002.png" in (tmp_path / "out" / "problems.csv").read_text()
+    assert "not a data set" in refused(capsys, "data", "check", tmp_path / "out", "--out", tmp_path / "out2")
+
+
+def test_frames_in_the_formats_of_others(frames, tmp_path, capsys):
+    truth = [example.corners_px for example in read_dataset(frames)]
+    for to in ("coco", "yolo"):
+        status, out, err = call(capsys, "data", "convert", frames, tmp_path / to, "--to", to, "--json")
+        assert status == 0, err
+        assert json.loads(out)["labels"] == 4
+        there = open_dataset(tmp_path / to)
+        assert there.format.lower().startswith(to)
+        for picture, corners in zip(sorted(there.pictures, key=lambda p: p.name), truth, strict=True):
+            np.testing.assert_allclose(picture.labels[0].corners_px, corners, atol=1e-5)
+    assert "--split" in refused(capsys, "data", "convert", frames, tmp_path / "x", "--to", "coco", "--split", "most")
+
+
+def test_the_audit_reads_rendered_frames(frames, tmp_path, capsys):
+    status, out, _ = call(
+        capsys, "audit", frames / "lard.csv", "--runways", frames / "runways.json", "--out", tmp_path, "--json"
+    )
+    assert status == 0
+    report = json.loads(out)
+    assert (report["labels"], report["contradicting"], report["not_checked"]) == (4, 0, 0)
+
+
+def test_a_bad_row_is_told_and_the_rest_is_run(frames, tmp_path, capsys):
+    lines = (frames / "lard.csv").read_text().splitlines()
+    column = lines[0].split(";").index("x_TL")
+    cells = lines[2].split(";")
+    lines[2] = ";".join([*cells[:column], "left", *cells[column + 1 :]])
+    (tmp_path / "labels.csv").write_text("\n".join(lines))
+    arguments = ["run", frames, "--labels", tmp_path / "labels.csv", "--runways", frames / "runways.json"]
+    status, out, err = call(capsys, *arguments, "--out", tmp_path / "out")
+    assert status == 0, err
+    assert "line 3: x_TL is 'left'" in " ".join(out.split())
+    status, out, _ = call(capsys, *arguments, "--out", tmp_path / "out", "--json")
+    assert json.loads(out)["frames"] == 3
+    assert json.loads(out)["rows_refused"] == 1

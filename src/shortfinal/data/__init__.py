@@ -1,1 +1,1 @@
-"""Label files, crops and the scene renderer: foreign conventions are converted here and nowhere else."""
+"""Data sets: read, written, fetched, checked, rendered. Foreign conventions are converted here and nowhere else."""

@@ -17,13 +17,16 @@ from numpy.typing import NDArray
 
 from shortfinal.geometry import Camera, Pose, can_project, project
 from shortfinal.runway import Runway, aiming_point_m
-from shortfinal.scene.noise import fractal, hash01, noise, packed, shader, smooth_step
+from shortfinal.scene.noise import fractal, hash01, noise, packed, shader, smooth_step, turf
 
 Array = NDArray[np.float64]
 Light = NDArray[np.float32]
 
+_STRIP_END, _STRIP_SIDE = 60.0, 75.0  # Annex 14, 3.4: of a runway's strip, beyond its ends and beside it
 _MOST_STRIPS = 16  # fixed, so that every airfield has one compiled layout
 _ARROWS, _CHEVRONS = 1.0, 2.0  # what is painted before a threshold
+# Shares of the kinds of pavement before the landing threshold, and beyond the far one (`_pad`).
+_BEFORE, _BEYOND = (0.24, 0.41, 0.22, 0.13), (0.44, 0.23, 0.2, 0.13)
 _PLAIN, _TAXIWAY = 0.0, 1.0
 # Annex 14, 5.2.4.5: width of the runway, number of threshold stripes.
 _STRIPES = ((18.0, 4), (23.0, 6), (30.0, 8), (45.0, 12), (60.0, 16))
@@ -87,7 +90,7 @@ def random_airfield(rng: np.random.Generator, runway: Runway | None, grass: Arra
         surface=surface,
         shoulder=np.clip(shoulder, 0.04, 0.9),
         shoulder_width=float(rng.choice([0.0, 0.0, u(1.0, 3.0), u(3.0, 7.5), 7.5])),
-        pad=np.array([_pad(rng, surface, stripe > 0) for _ in range(2)]),
+        pad=np.array([_pad(rng, surface, stripe > 0, shares) for shares in (_BEFORE, _BEYOND)]),
         concrete=_concrete(rng, surface, length),
         roughness=u(0.02, 0.12),
         patches=np.array([u(0, 0.12) * (rng.random() < 0.5), u(0.03, 0.2)]),
@@ -99,7 +102,7 @@ def random_airfield(rng: np.random.Generator, runway: Runway | None, grass: Arra
         bars=_bars(rng, width),
         threshold_line=_threshold_line(rng),
         side_stripe=stripe,
-        side_dash=u(8, 60) if rng.random() < 0.1 else 0.0,
+        side_dash=u(8, 60) if rng.random() < 0.2 else 0.0,
         centre_dash=_centre_line(rng),
         aiming=aiming,
         touchdown=np.array([_touchdown_pairs(length) if rng.random() < 0.7 else 0, float(rng.random() < 0.6)]),
@@ -134,18 +137,18 @@ def _other_colour(rng: np.random.Generator, surface: Array) -> Array:
     return np.asarray(np.clip(surface * ratio + rng.normal(0, 0.01, 3), 0.04, 0.92))
 
 
-def _pad(rng: np.random.Generator, surface: Array, striped: bool) -> Array:
+def _pad(rng: np.random.Generator, surface: Array, striped: bool, shares: tuple[float, ...]) -> Array:
     """Pavement before a threshold: none; a displaced threshold's; a blast pad or stopway; a worn stub."""
     u = rng.uniform
-    kind = rng.choice(["none", "displaced", "blast", "stub"], p=[0.22, 0.45, 0.2, 0.13])
+    kind = rng.choice(["none", "displaced", "blast", "stub"], p=shares)
     alike = surface * u(0.95, 1.05)
     if kind == "displaced":
         painted = _ARROWS if rng.random() < 0.75 else 0.0
         stripes = float(striped and rng.random() < 0.75)
         return np.array([np.exp(u(np.log(40), np.log(500))), *alike, painted, stripes, 1.0])
     if kind == "blast":
-        colour = alike if rng.random() < 0.3 else _other_colour(rng, surface)
-        return np.array([u(20, 120), *colour, _CHEVRONS * (rng.random() < 0.6), 0.0, u(0.85, 1.2)])
+        colour = alike if rng.random() < 0.5 else _other_colour(rng, surface)
+        return np.array([u(20, 120), *colour, _CHEVRONS * (rng.random() < 0.6), 0.0, u(0.85, 1.35)])
     if kind == "stub":
         colour = alike if rng.random() < 0.5 else _other_colour(rng, surface)
         return np.array([u(8, 60), *colour, 0.0, 0.0, u(0.6, 1.4)])
@@ -365,10 +368,17 @@ def record(airfield: Airfield) -> NDArray[np.void]:
 
 @shader
 def away(a: Any, x: Any, y: Any) -> Any:
-    """How far (x, y) lies outside the airfield's grounds, metres; 0 inside."""
+    """How far (x, y) lies outside the airfield's grounds, metres; 0 inside. They reach around both runways."""
     ahead = max(0.0, max(-x, x - a.length) - a.grounds[1])
     beside = max(0.0, abs(y) - a.grounds[0])
-    return math.sqrt(ahead * ahead + beside * beside)
+    least = math.sqrt(ahead * ahead + beside * beside)
+    if a.other[4] > 0.0:
+        dx, dy = x - a.other[0], y - a.other[1]
+        along, across = a.other[2] * dx + a.other[3] * dy, a.other[2] * dy - a.other[3] * dx
+        ahead = max(0.0, max(-along, along - a.other[4]) - _STRIP_END)
+        beside = max(0.0, abs(across) - 0.5 * a.other[5] - _STRIP_SIDE)
+        least = min(least, math.sqrt(ahead * ahead + beside * beside))
+    return least
 
 
 @shader
@@ -390,7 +400,7 @@ def ground(a: Any, table: Any, x: Any, y: Any, footprint: Any, rgb: Any) -> None
     if mown <= 0.0:
         return
     shift = 0.11 * (a.seed % 991)
-    patchy = 1.0 + 0.5 * fractal(table, x + shift, y - shift, 190.0, 5, footprint)
+    patchy = 1.0 + 0.3 * turf(table, x + shift, y - shift, footprint)
     dry = 0.16 * fractal(table, x - shift, y + shift, 420.0, 3, footprint)
     for c in range(3):
         rgb[c] += mown * (a.grounds[2 + c] * patchy * (1.0 + (1 - c) * dry) - rgb[c])

@@ -40,8 +40,6 @@ from shortfinal.scene.town import lamps, memory
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-_AIRFIELD_REACH_M = 3000.0  # pavement may lie so far outside the grounds
-
 
 class Scene(NamedTuple):
     """Everything a picture of one airfield depends on but the camera."""
@@ -214,11 +212,7 @@ def _ground_pixel(
                 tags, facts, o, base, rgb)  # fmt: skip
     ground(a, table, x, y, footprint, base)
     near = near_pavement(a, x, y, long + 2.0 * short, 2.0 * long * abs(wy) + 2.0 * short)
-    if near > 0:
-        samples = samples if near == 2 else max(1, min(2, samples))
-        count = samples
-    else:  # taxiways and further runways
-        count = min(2, samples) if away(a, x, y) < _AIRFIELD_REACH_M else 0
+    count = samples if near == 2 else min(2, samples) if near == 1 else 0
     if count > 0:
         texture = grain(a, table, x, y, footprint)
         total[:] = 0.0
