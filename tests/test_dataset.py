@@ -1,5 +1,6 @@
 import csv
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,10 +10,13 @@ from scipy.stats import kstest, uniform
 import shortfinal as sf
 from shortfinal.audit import audit_labels
 from shortfinal.data.dataset import plan_shot, read_dataset, write_dataset
+from shortfinal.data.formats import convert
 from shortfinal.data.image import read_image
 from shortfinal.data.lard import EARTH_STUDIO, NewLabel, read_labels, write_database, write_labels
 from shortfinal.files import write_whole
 from shortfinal.runway import load_database
+
+LARD_SAMPLE = Path(__file__).parents[2] / "shared" / "data" / "lard_sample"
 
 
 @pytest.fixture(scope="module")
@@ -124,10 +128,10 @@ def test_another_seed_is_not_mixed_in(folder):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda text: text.replace("near_left_u", "left_u"), "lacks the columns near_left_u"),
+        (lambda text: text.replace("near_left_u", "left_u"), "no column near_left_u"),
         (lambda text: "\n".join([*text.splitlines()[:2], text.splitlines()[2].rsplit(",", 1)[0] + ",nan"]),
          "line 3: far_left_v is 'nan'"),
-        (lambda text: text.splitlines()[0], "no rows"),
+        (lambda text: text.splitlines()[0], "a header without rows"),
     ],
 )  # fmt: skip
 def test_damaged_labels_are_named(folder, tmp_path, damage, message):
@@ -144,8 +148,28 @@ def test_a_missing_or_broken_picture_is_named(folder, tmp_path):
     (tmp_path / "images" / "000000.png").write_bytes(b"not a picture")
     with pytest.raises(sf.InputError, match=r"000000\.png: cannot be read"):
         read_dataset(tmp_path)[0]
-    with pytest.raises(sf.InputError, match="cannot read the labels"):
+    with pytest.raises(sf.InputError, match="no such folder"):
         read_dataset(tmp_path / "nowhere")
+
+
+def test_other_peoples_formats_are_examples_too(folder, tmp_path):
+    convert(folder, tmp_path / "yolo", "yolo")
+    truth = {Path(picture.name).name: corners for picture, corners in read_dataset(folder).labels}
+    for picture, corners in read_dataset(tmp_path / "yolo").labels:
+        np.testing.assert_allclose(corners, truth[Path(picture.name).name], atol=1e-5)
+
+
+@pytest.mark.skipif(not LARD_SAMPLE.is_dir(), reason="shared/data is absent")
+def test_lards_pictures_are_examples_in_stored_pixels():
+    examples = read_dataset(LARD_SAMPLE)
+    assert len(examples) == 78
+    image, corners = examples[0].image, examples[0].corners_px
+    assert image.shape == (640, 640, 3)
+    expected = (np.array([[1622, 1130], [1642, 1129], [1641, 1097], [1625, 1098]]) + 0.5) * [
+        640 / 2448,
+        640 / 2648,
+    ] - 0.5
+    np.testing.assert_allclose(corners, expected)
 
 
 def test_a_jpeg_that_is_cut_off_is_refused(tmp_path):

@@ -212,8 +212,8 @@ def solve(
 
 @app.command()
 def train(
-    data: Annotated[Path, typer.Option(help="Training scenes, from `shortfinal data render`.")],
-    validation: Annotated[Path, typer.Option(help="Held-out scenes, rendered with another seed.")],
+    data: Annotated[Path, typer.Option(help="Data set to train on: rendered, or LARD's, COCO keypoints, YOLO-pose.")],
+    validation: Annotated[Path, typer.Option(help="Held-out data set, e.g. rendered with another seed.")],
     out: Out = Path("runs/latest"),
     backbone: Annotated[str, typer.Option(help="Any timm model.")] = "mobilenetv3_small_100",
     steps: Annotated[int, typer.Option(help="Batches to train on.", min=1)] = 10000,

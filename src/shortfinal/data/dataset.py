@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shortfinal.crops import bogo_crop, box_around
+from shortfinal.data.formats import open_dataset
 from shortfinal.data.image import Image, read_image
+from shortfinal.data.labelled import Picture
 from shortfinal.data.lard import NAUTICAL_MILE_M, NewLabel, write_database, write_labels
-from shortfinal.data.table import read_table
 from shortfinal.errors import InputError
 from shortfinal.files import csv_text, make_folder, write_png, write_whole
 from shortfinal.geometry import Camera, Pose, can_project, project, unproject
@@ -39,7 +40,6 @@ COLUMNS = (
     "near_left_u", "near_left_v", "near_right_u", "near_right_v",
     "far_right_u", "far_right_v", "far_left_u", "far_left_v",
 )  # fmt: skip
-_CORNER_COLUMNS = COLUMNS[-8:]
 _TRIES, _BORDER_PX = 50, 1.0
 
 
@@ -225,36 +225,40 @@ def _is_whole_png(path: Path) -> bool:
         return False
 
 
-class RenderedDataset:
-    """The examples of a data set on disk, read when asked for."""
+class LabelledDataset:
+    """The examples of a data set, one a labelled runway, read when asked for."""
 
-    def __init__(self, folder: Path, names: list[str], corners_px: Array) -> None:
-        self.folder, self.names, self.corners_px = folder, names, corners_px
+    def __init__(self, labels: Sequence[tuple[Picture, Array]]) -> None:
+        self.labels = labels  # the picture, and the corners (4, 2) in pixels of the image they were labelled on
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self.labels)
 
     def __getitem__(self, index: int) -> Example:
-        path = self.folder / self.names[index]
-        return Example(read_image(path), self.corners_px[index])
+        picture, corners = self.labels[index]
+        image = read_image(picture.path)
+        height, width = image.shape[:2]
+        if picture.wrong_size(width, height):
+            raise InputError(f"{picture.path}: {width} x {height} pixels, but its labels are for {picture.size}")
+        return Example(image, picture.window(width, height).apply(corners))
 
 
-def read_dataset(folder: str | Path) -> RenderedDataset:
-    """A data set written by `write_dataset`.
+def read_dataset(folder: str | Path) -> LabelledDataset:
+    """A data set to train on, in any format `open_dataset` knows.
 
-    Raises InputError naming the file, the line and the field, or the first picture that is missing.
+    Raises InputError naming the file, the line and the field of the first label that is wrong or
+    lacks a corner, or the first picture that is missing.
     """
-    path = Path(folder) / "labels.csv"
-    table = read_table(path)
-    if not table.records:
-        raise InputError(f"{path}: no rows; `shortfinal data render` writes them")
-    missing = [c for c in ("image", *_CORNER_COLUMNS) if c not in table.columns]
-    if missing:
-        raise InputError(f"{path}: lacks the columns {', '.join(missing)}")
-    rows = list(table.rows())
-    corners = np.array([[row.number(name) for name in _CORNER_COLUMNS] for row in rows]).reshape(-1, 4, 2)
-    for row in rows:
-        picture = os.path.join(path.parent, row.get("image"))
-        if not os.path.isfile(picture):
-            raise InputError(f"{path}: line {row.line}: {picture}: no such image")
-    return RenderedDataset(path.parent, [row.get("image") for row in rows], corners)
+    data = open_dataset(folder)
+    if data.refused:
+        more = f" ({len(data.refused) - 1} more: see `shortfinal data check`)" if data.refused[1:] else ""
+        raise InputError(f"{data.refused[0]}{more}")
+    labels = []
+    for picture in data.pictures:
+        if not picture.path.is_file():
+            raise InputError(f"{picture.path}: no such image")
+        for label in picture.labels:
+            if label.corners_px is None:
+                raise InputError(f"{label.file}: {label.row}: not all four corners are labelled; complete or remove it")
+            labels.append((picture, label.corners_px))
+    return LabelledDataset(labels)

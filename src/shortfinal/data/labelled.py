@@ -60,7 +60,8 @@ class Problem:
     serious: bool = True  # False: worth knowing, and no fault
 
     def __str__(self) -> str:
-        place = ": ".join(part for part in (self.file, self.row, self.field) if part)
+        field = "" if self.what.startswith(f"{self.field} is ") else self.field
+        place = ": ".join(part for part in (self.file, self.row, field) if part)
         return f"{place}: {self.what}" + (f"; {self.mend}" if self.mend else "")
 
 
