@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import shortfinal as sf
-from shortfinal.data import cover, town
+from shortfinal.scene import cover, town
 from shortfinal.scene.airfield import away
 from shortfinal.scene.land import random_climate, random_land
 from shortfinal.scene.noise import noise, noise_table, outline, packed

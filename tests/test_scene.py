@@ -4,7 +4,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import shortfinal as sf
-from shortfinal.scene.render import Motion, Scene, Sensor, project_rolling, random_scene, random_sensor, render
+from shortfinal.scene.render import Motion, Scene, project_rolling, random_scene, render
+from shortfinal.scene.sensor import Sensor, random_sensor
 
 RUNWAY = sf.Runway(1800, 45)
 CAMERA = sf.Camera(800, 600, 1100, 1100, 399.5, 299.5)
