@@ -80,9 +80,11 @@ def test_without_a_box_it_looks_where_the_last_accepted_frame_was(frame):
     assert fresh.step(frame).verdict.decision is Decision.USE
 
 
-def test_a_slid_corner_is_refused(pipeline, frame):
-    found = pipeline.step(frame, box=BOX).keypoints
-    _, verdict, _ = pipeline.judge(inject(Fault.NEAR_CORNER, TRUTH)(found))
+def test_a_slid_corner_is_refused(pipeline):
+    truth = approach_pose(50)  # where the demo injects it
+    box = box_around(sf.project(CAMERA, truth, RUNWAY.corners))
+    found = pipeline.step(render_frame(demo_scene(), 50), box=box).keypoints
+    _, verdict, _ = pipeline.judge(inject(Fault.NEAR_CORNER, truth)(found))
     assert verdict.decision is Decision.DO_NOT_USE
     assert "do not fit the runway" in verdict.reasons[0]
 
