@@ -546,6 +546,7 @@ def test_other_code_or_a_damaged_journal_is_refused(tmp_path, monkeypatch):
     assert journal.read_bytes() != whole  # refused, not mended
 
 
+@pytest.mark.slow
 def test_any_number_of_workers_counts_the_same(tmp_path, monkeypatch):
     small_chunks(monkeypatch)
     campaign = read_campaign(campaign_file(tmp_path, SMALL, trials=1000))

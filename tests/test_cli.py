@@ -45,13 +45,19 @@ def refused(capsys, *arguments):
     return err
 
 
-@pytest.fixture
-def folder(tmp_path):
-    """Two frames with boxes, and their camera."""
+@pytest.fixture(scope="module")
+def pictures():
+    """Two frames of the demo."""
     scene = demo_scene()
+    return {number: render_frame(scene, number) for number in (60, 80)}
+
+
+@pytest.fixture
+def folder(tmp_path, pictures):
+    """Two frames with boxes, and their camera."""
     lines = ["image,left,top,right,bottom"]
-    for number in (60, 80):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), render_frame(scene, number)[..., ::-1])
+    for number, picture in pictures.items():
+        cv2.imwrite(str(tmp_path / f"{number}.png"), picture[..., ::-1])
         box = box_around(sf.project(CAMERA, approach_pose(number), RUNWAY.corners))
         lines.append(f"{number}.png," + ",".join(f"{v:.1f}" for v in box))
     (tmp_path / "labels.csv").write_text("\n".join(lines) + "\n")
