@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from marks import dots, measure
 
-from shortfinal.data.augment import EFFECTS, Warp, augmented_crop, night, occlusion, random_warp, training_crop
+from shortfinal.data.augment import EFFECTS, Warp, augmented_crop, night, occlusion, random_warp
 from shortfinal.data.dataset import Example
 
 SIZE = 224
@@ -24,7 +24,7 @@ def test_corners_land_where_the_picture_shows_them(spread, sigma):
     rng, turns, mirrored = np.random.default_rng(1), [], 0
     for seed in rng.integers(0, 2**31, 40):
         warp = random_warp(shot.corners_px, (640, 480), SIZE, np.random.default_rng(seed))
-        crop, corners = training_crop(shot, SIZE, np.random.default_rng(seed))
+        crop, corners = warp.cut(shot.image), warp.apply(shot.corners_px)
         assert ((corners > 0) & (corners < SIZE - 1)).all()
         shifts, heights = measure(crop, corners, sigma * warp.scale)
         assert np.abs(shifts).max() < 0.05

@@ -9,8 +9,9 @@ import pytest
 from test_lard import V2_HEAD, see, v2_row
 
 import shortfinal as sf
+from shortfinal.data.fetch import LARD_V2_SUBSETS
 from shortfinal.data.lard import LARD_V2, read_labels
-from shortfinal.data.parquet import SUBSETS, stream_lard_v2
+from shortfinal.data.parquet import stream_lard_v2
 
 pa = pytest.importorskip("pyarrow", reason="the extra data is not installed")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -132,7 +133,7 @@ def test_the_camera_may_be_given(tmp_path):
 
 
 def test_what_cannot_be_streamed_is_refused_at_once(tmp_path, monkeypatch):
-    with pytest.raises(sf.InputError, match=f"subset 'bing': LARD v2 has {', '.join(SUBSETS)}"):
+    with pytest.raises(sf.InputError, match=f"subset 'bing': LARD v2 has {', '.join(LARD_V2_SUBSETS)}"):
         stream_lard_v2(tmp_path, "bing")
     with pytest.raises(sf.InputError, match=r"holds neither flsim/train\*\.parquet nor train\*\.parquet"):
         stream_lard_v2(tmp_path, "flsim")

@@ -10,7 +10,7 @@ from shortfinal.errors import JobError
 
 torch = pytest.importorskip("torch")
 
-from shortfinal.data.augment import training_crop  # noqa: E402
+from shortfinal.data.augment import random_warp  # noqa: E402
 from shortfinal.train.export import compare, export, load_network  # noqa: E402
 from shortfinal.train.fit import Recipe, train  # noqa: E402
 from shortfinal.train.model import KeypointNet, gaussian_nll, soft_argmax, to_pixels, variance_px  # noqa: E402
@@ -67,7 +67,6 @@ def test_the_half_on_the_logarithm_makes_sigma_right(half, ratio):
 
 def test_crops_move_the_labels_with_the_picture():
     # A picture that is bright only at its corners' places: the crop is bright where the labels say.
-    from shortfinal.data.dataset import Example
 
     corners = np.array([[30.0, 70], [60, 72], [55, 31], [40, 30]])
     image = np.zeros((100, 100, 3), np.uint8)
@@ -76,7 +75,8 @@ def test_crops_move_the_labels_with_the_picture():
     rng = np.random.default_rng(0)
     orders = set()
     for _ in range(30):
-        crop, moved = training_crop(Example(image, corners), 224, rng)
+        warp = random_warp(corners, (100, 100), 224, rng)
+        crop, moved = warp.cut(image), warp.apply(corners)
         near_left, near_right = moved[:2]
         assert near_left[0] < near_right[0]  # mirrored or not, left is left
         orders.add(bool(moved[3, 0] - near_left[0] > 0.3 * (near_right[0] - near_left[0])))

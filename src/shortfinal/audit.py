@@ -190,7 +190,7 @@ def audit_labels(
         raise InputError(f"sigma_px: got {sigma_px}; it must be finite and > 0")
     if not 0 < false_alarm_rate < POWER:
         raise InputError(f"false_alarm_rate: got {false_alarm_rate}; it must lie between 0 and {POWER:g}")
-    runways = {ident: _look_up(database, ident) for ident in {label.ident for label in labels}}
+    runways = {ident: look_up(database, ident) for ident in {label.ident for label in labels}}
     audited = [
         audit_label(
             label, runways[label.ident], camera or label.camera, sigma_px or label.rounding_sigma_px, false_alarm_rate
@@ -201,10 +201,12 @@ def audit_labels(
     return AuditReport(source, tuple(sorted(audited, key=_badness)), sigma_px, false_alarm_rate, refused)
 
 
-def _look_up(database: RunwayDatabase, ident: str) -> Runway | str:
-    """The runway, or why there is none."""
+def look_up(database: RunwayDatabase | None, ident: str) -> Runway | str:
+    """The runway of that name in a database, or why there is none."""
     if not ident:
         return "the label names no runway"
+    if database is None:
+        return "no runway database: pass --runways"
     try:
         return database.find(ident)
     except InputError as error:

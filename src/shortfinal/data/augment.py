@@ -95,13 +95,6 @@ def random_warp(corners_px: Array, image_size: tuple[int, int], size: int, rng: 
     return Warp(matrix, size, mirrored, border)
 
 
-def training_crop(example: Example, size: int, rng: np.random.Generator) -> tuple[Image, Array]:
-    """A random crop (size, size, 3) of an example, and its corners (4, 2). Geometry only."""
-    height, width = example.image.shape[:2]
-    warp = random_warp(example.corners_px, (width, height), size, rng)
-    return warp.cut(example.image), warp.apply(example.corners_px)
-
-
 def augmented_crop(example: Example, size: int, rng: np.random.Generator) -> tuple[Image, Array]:
     """A random crop (size, size, 3) of an example as another camera in other weather saw it; its corners (4, 2).
 

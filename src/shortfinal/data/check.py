@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 
-from shortfinal.audit import AuditedLabel, AuditReport, audit_label
+from shortfinal.audit import AuditedLabel, AuditReport, audit_label, look_up
 from shortfinal.crops import box_around, centre_crop
 from shortfinal.data.formats import open_dataset
 from shortfinal.data.image import read_image
 from shortfinal.data.labelled import Label, LabelledPictures, Origin, Picture, Problem
-from shortfinal.data.lard import WHOLE_PIXEL_SIGMA, RunwayLabel
+from shortfinal.data.lard import AIMING_POINT_M, WHOLE_PIXEL_SIGMA, RunwayLabel
 from shortfinal.errors import InputError
 from shortfinal.files import csv_text, make_folder, write_png, write_whole
 from shortfinal.geometry import Camera, PixelWindow, Pose
@@ -47,7 +47,6 @@ RENDERED_SIGMA = 0.05  # px: how exact the labels of rendered pictures claim to 
 SAME_SCENE = 0.05
 TOO_SMALL_PX = 8.0  # longer side of the runway's box; the renderer begins at 11
 FLAT = 1.0  # standard deviation of the grey levels below which there is nothing to be seen
-APEX_M = 305.0  # where the glide path meets the runway, past the threshold, as in LARD
 
 _THUMBNAIL = 8  # pixels a side
 _ORIENTATION = 274  # EXIF tag
@@ -169,14 +168,7 @@ class _Ground:
         """The label's runway, or why there is none."""
         if label.runway is not None:
             return label.runway
-        if not label.ident:
-            return "the label names no runway"
-        if self.database is None:
-            return "no runway database: pass --runways"
-        try:
-            return self.database.find(label.ident)
-        except InputError as error:
-            return str(error)
+        return look_up(self.database, label.ident)
 
     def sigma(self, label: Label) -> float:
         return self.sigma_px or (RENDERED_SIGMA if label.pose is not None else WHOLE_PIXEL_SIGMA)
@@ -316,7 +308,7 @@ def _recorded(label: Label, picture: Picture, camera: Camera | None, sigma: floa
 def _flight(pose: Pose) -> list[tuple[str, float]]:
     x, y, z = (float(v) for v in pose.position_m)
     yaw, pitch, roll = pose.attitude
-    glide, lateral = math.degrees(math.atan2(z, APEX_M - x)), math.degrees(math.atan2(y, -x))
+    glide, lateral = math.degrees(math.atan2(z, AIMING_POINT_M - x)), math.degrees(math.atan2(y, -x))
     distance = float(np.linalg.norm(pose.position_m))
     values = (distance, glide, lateral, yaw, pitch, roll)
     return list(zip(MEASURES, values, strict=False))

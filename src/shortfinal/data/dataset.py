@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shortfinal.crops import bogo_crop, box_around
-from shortfinal.data.formats import open_dataset
+from shortfinal.data.formats import CAMERA_COLUMNS, CORNER_COLUMNS, POSE_COLUMNS, open_dataset
 from shortfinal.data.image import Image, read_image
 from shortfinal.data.labelled import Picture
-from shortfinal.data.lard import NAUTICAL_MILE_M, NewLabel, write_database, write_labels
+from shortfinal.data.lard import AIMING_POINT_M, NAUTICAL_MILE_M, NewLabel, write_database, write_labels
 from shortfinal.errors import InputError
 from shortfinal.files import csv_text, make_folder, write_png, write_whole
 from shortfinal.geometry import Camera, Pose, can_project, project, unproject
@@ -35,10 +35,7 @@ from shortfinal.scene.sensor import Sensor, random_sensor
 Array = NDArray[np.float64]
 
 COLUMNS = (
-    "image", "ident", "width", "height", "fx", "fy", "cx", "cy", "distortion", "length_m", "width_m",
-    "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg",
-    "near_left_u", "near_left_v", "near_right_u", "near_right_v",
-    "far_right_u", "far_right_v", "far_left_u", "far_left_v",
+    "image", "ident", *CAMERA_COLUMNS, "distortion", "length_m", "width_m", *POSE_COLUMNS, *CORNER_COLUMNS
 )  # fmt: skip
 _TRIES, _BORDER_PX = 50, 1.0
 
@@ -61,7 +58,7 @@ def random_approach(rng: np.random.Generator, visibility_m: float = math.inf) ->
     farthest = min(4.5, 0.7 * visibility_m / NAUTICAL_MILE_M)
     distance = float(np.exp(rng.uniform(np.log(0.05), np.log(farthest)))) * NAUTICAL_MILE_M
     lateral, glide = np.radians([rng.uniform(-5, 5), rng.uniform(1.8, 4.5)])
-    height = (distance + 305.0) * np.tan(glide)
+    height = (distance + AIMING_POINT_M) * np.tan(glide)
     attitude = rng.uniform([-12, -9, -12], [12, 1, 12])
     return Pose.from_attitude([-distance, distance * np.tan(lateral), height], *attitude)
 
@@ -80,7 +77,7 @@ class Shot:
     @property
     def runway(self) -> Runway:
         """The scene's, flat."""
-        return Runway(self.scene.airfield.length, self.scene.airfield.width, self.ident)
+        return replace(self.scene.runway, ident=self.ident)
 
     @property
     def corners_px(self) -> Array:
@@ -110,7 +107,7 @@ def plan_shot(seed: int, index: int, camera: Camera | None = None) -> Shot:
     """
     rng = np.random.default_rng([seed, index])
     scene = random_scene(rng)
-    runway = Runway(scene.airfield.length, scene.airfield.width)
+    runway = scene.runway
     if camera is None:
         pose = random_approach(rng, scene.sky.visibility_m)
         camera = _view(runway, pose, rng)

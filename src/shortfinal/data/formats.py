@@ -41,9 +41,10 @@ from shortfinal.runway import Runway
 
 Target = Literal["coco", "yolo"]
 
-_OWN_CORNERS = tuple(f"{name.replace('-', '_')}_{axis}" for name in CORNER_NAMES for axis in "uv")
-_CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
-_POSE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
+# Of our own labels.csv.
+CORNER_COLUMNS = tuple(f"{name.replace('-', '_')}_{axis}" for name in CORNER_NAMES for axis in "uv")
+CAMERA_COLUMNS = ("width", "height", "fx", "fy", "cx", "cy")
+POSE_COLUMNS = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
 _LARD_COLUMNS = ({"x_A", "y_A", "x_D", "y_D"}, {"x_TL", "y_TL", "x_BR", "y_BR"})
 _ALL_SEEN = np.full(4, 2, np.int8)
 _ALL_SEEN.setflags(write=False)
@@ -141,7 +142,7 @@ def _kind(file: Path) -> str:
 def _table_kind(file: Path) -> str:
     with open(file, encoding="utf-8-sig") as lines:
         columns = set(next(lines, "").strip().replace(";", ",").split(","))
-    if len(columns & set(_OWN_CORNERS)) > 4:
+    if len(columns & set(CORNER_COLUMNS)) > 4:
         return "shortfinal"
     return "LARD" if any(wanted <= columns for wanted in _LARD_COLUMNS) else ""
 
@@ -203,7 +204,7 @@ def _pictures(rows: Iterable[_TableRow], root: Path) -> list[Picture]:
 
 def _read_own(file: Path, camera: Camera | None) -> tuple[list[_TableRow], list[Problem]]:
     table = read_table(file)
-    missing = [name for name in ("image", *_OWN_CORNERS) if name not in table.columns]
+    missing = [name for name in ("image", *CORNER_COLUMNS) if name not in table.columns]
     if missing:
         raise InputError(f"{file}: line 1: no column {', '.join(missing)}")
     if not table.records:
@@ -217,12 +218,12 @@ def _problems(refusals: Iterable[Refusal], file: Path) -> list[Problem]:
 
 
 def _own_row(row: Row, given: Camera | None) -> _TableRow:
-    corners = np.array([row.number(name, -LARGEST_PX, LARGEST_PX) for name in _OWN_CORNERS]).reshape(4, 2)
+    corners = np.array([row.number(name, -LARGEST_PX, LARGEST_PX) for name in CORNER_COLUMNS]).reshape(4, 2)
     camera = given or _own_camera(row)
     image = row.text("image")
     pose = None
-    if all(name in row.columns for name in _POSE):
-        numbers = [row.number(name) for name in _POSE]
+    if all(name in row.columns for name in POSE_COLUMNS):
+        numbers = [row.number(name) for name in POSE_COLUMNS]
         pose = Pose.from_attitude(numbers[:3], *numbers[3:])
     runway = None
     if row.get("length_m") and row.get("width_m"):
@@ -237,12 +238,12 @@ def _own_row(row: Row, given: Camera | None) -> _TableRow:
 
 
 def _own_camera(row: Row) -> Camera | None:
-    if not all(name in row.columns for name in _CAMERA):
+    if not all(name in row.columns for name in CAMERA_COLUMNS):
         return None
-    values = {name: row.number(name, 0.1, 1e6) for name in _CAMERA[:4]} | {
-        name: row.number(name) for name in _CAMERA[4:]
+    values = {name: row.number(name, 0.1, 1e6) for name in CAMERA_COLUMNS[:4]} | {
+        name: row.number(name) for name in CAMERA_COLUMNS[4:]
     }
-    for name in _CAMERA[:2]:
+    for name in CAMERA_COLUMNS[:2]:
         if values[name] % 1:
             row.refuse(name, "expected a whole number of pixels")
     width, height, fx, fy, cx, cy = values.values()

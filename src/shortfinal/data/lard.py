@@ -56,7 +56,7 @@ OWN = "shortfinal"  # `type` of the rows that `write_labels` writes
 _EARTH_RADIUS_M = 6_371_000.0
 _V1_DISTANCE_STEP_M = 0.01 * NAUTICAL_MILE_M  # to which v1 rounds, before the test set's kilometres too
 _DISTANCE_UNITS_M = {"slant_distance": NAUTICAL_MILE_M, "slant_distance_km": 1000.0}
-_AIMING_POINT_M = 305.0  # past the threshold: the apex of `vertical_path_angle`
+AIMING_POINT_M = 305.0  # past the threshold: the apex of `vertical_path_angle`
 _FARTHEST_PX = 1e5  # of a corner, where no camera says how large the picture is
 
 _PLACE = ("image", "airport", "runway")
@@ -454,7 +454,7 @@ def _cells_of(row: NewLabel) -> list[str]:
     read = sorted(corners.tolist(), key=lambda c: (c[1], c[0]))
     along, left, height = (float(v) for v in position * [-1.0, 1.0, 1.0])
     lateral = math.degrees(math.atan2(-left, along))
-    vertical = math.degrees(math.atan2(height, along + _AIMING_POINT_M))
+    vertical = math.degrees(math.atan2(height, along + AIMING_POINT_M))
     yaw, pitch, roll = row.pose.attitude
     heading = (yaw + _laid_heading(direction) + 180.0) % 360.0 - 180.0
     numbers = [

@@ -12,18 +12,16 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from shortfinal.data.fetch import LARD_V2, LARD_V2_SUBSETS
 from shortfinal.data.image import Image, decode_image
 from shortfinal.data.lard import RunwayLabel, check_columns, label_of
 from shortfinal.data.table import Refusal, Row
 from shortfinal.errors import InputError
 from shortfinal.geometry import Camera
 
-HUB_NAME = "DEEL-AI/LARD_V2"
-SUBSETS = ("ges", "arcgis", "bingmaps", "xplane", "flsim")
-
 
 def stream_lard_v2(
-    source: str | Path = HUB_NAME,
+    source: str | Path = LARD_V2,
     subset: str = "flsim",
     split: str = "train",
     *,
@@ -39,18 +37,18 @@ def stream_lard_v2(
     subset, a folder without such files, or columns that are not LARD's, and, where the package
     `datasets` is missing, one that says how to get it.
     """
-    if subset not in SUBSETS:
-        raise InputError(f"subset {subset!r}: LARD v2 has {', '.join(SUBSETS)}")
+    if subset not in LARD_V2_SUBSETS:
+        raise InputError(f"subset {subset!r}: LARD v2 has {', '.join(LARD_V2_SUBSETS)}")
     try:
         import datasets
     except ImportError as error:
         raise InputError("LARD v2's parquet needs the package datasets: pip install 'shortfinal[data]'") from error
     tell = refused or (lambda refusal: None)
     if not Path(source).is_dir():
-        if str(source) != HUB_NAME:
-            raise InputError(f"{source}: no such folder; give one of parquet files, or {HUB_NAME}")
-        rows = datasets.load_dataset(HUB_NAME, subset, split=split, streaming=True)
-        return _examples(rows, f"{HUB_NAME}/{subset}/{split}", camera, tell)
+        if str(source) != LARD_V2:
+            raise InputError(f"{source}: no such folder; give one of parquet files, or {LARD_V2}")
+        rows = datasets.load_dataset(LARD_V2, subset, split=split, streaming=True)
+        return _examples(rows, f"{LARD_V2}/{subset}/{split}", camera, tell)
     files = _files(Path(source), subset, split)
     return chain.from_iterable(_file(path, camera, tell) for path in files)
 

@@ -367,14 +367,20 @@ def record(airfield: Airfield) -> NDArray[np.void]:
 
 
 @shader
+def _on_other(a: Any, x: Any, y: Any) -> Any:
+    """(x, y) along and across the second runway, from its threshold."""
+    dx, dy = x - a.other[0], y - a.other[1]
+    return a.other[2] * dx + a.other[3] * dy, a.other[2] * dy - a.other[3] * dx
+
+
+@shader
 def away(a: Any, x: Any, y: Any) -> Any:
     """How far (x, y) lies outside the airfield's grounds, metres; 0 inside. They reach around both runways."""
     ahead = max(0.0, max(-x, x - a.length) - a.grounds[1])
     beside = max(0.0, abs(y) - a.grounds[0])
     least = math.sqrt(ahead * ahead + beside * beside)
     if a.other[4] > 0.0:
-        dx, dy = x - a.other[0], y - a.other[1]
-        along, across = a.other[2] * dx + a.other[3] * dy, a.other[2] * dy - a.other[3] * dx
+        along, across = _on_other(a, x, y)
         ahead = max(0.0, max(-along, along - a.other[4]) - _STRIP_END)
         beside = max(0.0, abs(across) - 0.5 * a.other[5] - _STRIP_SIDE)
         least = min(least, math.sqrt(ahead * ahead + beside * beside))
@@ -423,8 +429,7 @@ def paved(a: Any, table: Any, x: Any, y: Any, texture: Any, rgb: Any) -> Any:
     if near_pavement(a, x, y, 0.0, 0.0) == 2 and _runway(a, table, x, y, texture, rgb):
         return True
     if a.other[4] > 0.0:
-        dx, dy = x - a.other[0], y - a.other[1]
-        along, across = a.other[2] * dx + a.other[3] * dy, a.other[2] * dy - a.other[3] * dx
+        along, across = _on_other(a, x, y)
         if 0.0 <= along <= a.other[4] and abs(across) <= 0.5 * a.other[5]:
             _surface(a, table, along, across, a.other[4], rgb)
             end = 0 if along < 0.5 * a.other[4] else 1

@@ -40,6 +40,14 @@ def region(g: Any, x: Any, y: Any) -> Any:
 
 
 @shader
+def _cut(at_m: Any, length: Any, share: Any) -> Any:
+    """The part of a length, cut at a share of it, with `at_m` in it: how far in, how long, if the second."""
+    if at_m < share * length:
+        return at_m, length * share, 0
+    return at_m - share * length, length * (1.0 - share), 1
+
+
+@shader
 def _parcel(g: Any, u: Any, v: Any, key: Any) -> Any:
     """The parcel at (u, v) of a region: its key, the distance to its edge, whether it runs along v, the way across."""
     wide = g.parcel[0] * (0.6 + 0.8 * hash01(key, 3, 5))
@@ -56,20 +64,11 @@ def _parcel(g: Any, u: Any, v: Any, key: Any) -> Any:
             break
         at = 0.3 + 0.4 * hash01(key, level, 8)
         if wide * stretch > high:
-            if p < at * wide:
-                wide *= at
-                key = 2 * key + 1
-            else:
-                p -= at * wide
-                wide *= 1.0 - at
-                key = 2 * key + 2
-        elif q < at * high:
-            high *= at
-            key = 2 * key + 3
+            p, wide, second = _cut(p, wide, at)
+            key = 2 * key + 1 + second
         else:
-            q -= at * high
-            high *= 1.0 - at
-            key = 2 * key + 4
+            q, high, second = _cut(q, high, at)
+            key = 2 * key + 3 + second
     edge = min(min(p, wide - p), min(q, high - q))
     along = wide < high
     return key, edge, p if along else q, min(wide, high)

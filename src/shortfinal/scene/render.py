@@ -48,6 +48,11 @@ class Scene(NamedTuple):
     land: Land
     sky: Sky
 
+    @property
+    def runway(self) -> Runway:
+        """The airfield's, flat and without a name."""
+        return Runway(self.airfield.length, self.airfield.width)
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -147,7 +152,7 @@ def render(
     _render_kernel(*parts, camera.intrinsics, rotations, positions, noise_table(), samples, light)
     if scene.sky.darkness >= 0.0:
         add_lights(light, scene.airfield, camera, pose, scene.sky.darkness, scene.sky.visibility_m)
-    corners = Runway(scene.airfield.length, scene.airfield.width).corners
+    corners = scene.runway.corners
     seen = can_project(camera, pose, corners).all()
     keep_out = box_around(project(camera, pose, corners)) if seen else None  # without it nothing is laid over
     return expose(light, sensor or Sensor(), np.random.default_rng(seed), keep_out)
