@@ -5,14 +5,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scipy.stats import kstest, uniform
+from scipy.stats import binomtest, kstest, uniform
 
 import shortfinal as sf
 from shortfinal.audit import audit_labels
-from shortfinal.data.dataset import plan_shot, read_dataset, write_dataset
-from shortfinal.data.formats import convert
+from shortfinal.data.augment import inside
+from shortfinal.data.check import check_dataset
+from shortfinal.data.dataset import LARD_CONE, plan_shot, read_dataset, write_dataset
+from shortfinal.data.formats import CORNER_COLUMNS, convert, open_dataset
 from shortfinal.data.image import read_image
-from shortfinal.data.lard import EARTH_STUDIO, NewLabel, read_labels, write_database, write_labels
+from shortfinal.data.lard import (
+    AIMING_POINT_M,
+    EARTH_STUDIO,
+    NAUTICAL_MILE_M,
+    NewLabel,
+    read_labels,
+    write_database,
+    write_labels,
+)
 from shortfinal.files import write_whole
 from shortfinal.runway import load_database
 
@@ -26,19 +36,152 @@ def folder(tmp_path_factory):
     return path
 
 
-def test_labels_agree_with_the_camera_of_their_row(folder):
+@pytest.fixture(scope="module")
+def views(tmp_path_factory):
+    """Views of runways, of ends of them (3, 5 to 7), and of land without one (2)."""
+    path = tmp_path_factory.mktemp("views")
+    write_dataset(path, 8, seed=5)
+    return path
+
+
+@pytest.fixture(scope="module")
+def crops(tmp_path_factory):
+    """The paper's crops of LARD's camera."""
+    path = tmp_path_factory.mktemp("crops")
+    write_dataset(path, 3, seed=6, camera=EARTH_STUDIO, crop_px=96)
+    return path
+
+
+def rows_of(folder):
     with (folder / "labels.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    for row, example in zip(rows, read_dataset(folder)):
-        v = {k: float(row[k]) for k in row if k not in ("image", "ident", "distortion")}
-        lens = tuple(float(k) for k in row["distortion"].split())
-        camera = sf.Camera(int(v["width"]), int(v["height"]), v["fx"], v["fy"], v["cx"], v["cy"], lens)
-        pose = sf.Pose.from_attitude([v["x_m"], v["y_m"], v["z_m"]], v["yaw_deg"], v["pitch_deg"], v["roll_deg"])
-        px = sf.project(camera, pose, sf.Runway(v["length_m"], v["width_m"]).corners)
-        np.testing.assert_allclose(example.corners_px, px, atol=1e-3)
+        return list(csv.DictReader(file))
+
+
+def as_recorded(row):
+    """Camera and corners as a row's numbers have them."""
+    v = {k: float(row[k]) for k in row if k not in ("image", "ident", "distortion") and k[-2:] not in ("_u", "_v")}
+    lens = tuple(float(k) for k in row["distortion"].split())
+    camera = sf.Camera(int(v["width"]), int(v["height"]), v["fx"], v["fy"], v["cx"], v["cy"], lens)
+    pose = sf.Pose.from_attitude([v["x_m"], v["y_m"], v["z_m"]], v["yaw_deg"], v["pitch_deg"], v["roll_deg"])
+    return camera, sf.project(camera, pose, sf.Runway(v["length_m"], v["width_m"]).corners)
+
+
+@pytest.mark.parametrize("name", ["folder", "views", "crops"])
+def test_labels_agree_with_the_camera_of_their_row(name, request):
+    folder = request.getfixturevalue(name)
+    for row, example in zip(rows_of(folder), read_dataset(folder), strict=True):
+        camera, px = as_recorded(row)
         assert example.image.shape == (camera.height, camera.width, 3)
-        assert (px > -0.5).all()
-        assert (px < camera.width - 0.5).all()
+        if example.corners_px is None:
+            assert not inside(px, camera.width, camera.height).any()
+            continue
+        np.testing.assert_allclose(example.corners_px, px, atol=1e-3, rtol=1e-6)  # beyond the border, to nine digits
+        seen = inside(px, camera.width, camera.height)
+        assert seen.all() if name != "views" else seen.sum() >= 2
+
+
+def test_views_show_runways_ends_of_them_and_land():
+    shots = [plan_shot(4, n) for n in range(400)]
+    sizes = np.array([s.camera.width for s in shots])
+    assert (sizes == [s.camera.height for s in shots]).all()
+    land = [s for s in shots if s.empty]
+    assert binomtest(len(land), 400, 0.1).pvalue > 0.001
+    kinds = [inside(s.corners_px, s.camera.width, s.camera.height) for s in shots if not s.empty]
+    whole = sum(seen.all() for seen in kinds)
+    # Some views of an end hold the other too.
+    assert 0.65 * 400 - 4 * 9.5 < whole < 0.9 * 400
+    ends = [seen for seen in kinds if not seen.all()]
+    near, far = (sum(seen[pair].all() for seen in ends) for pair in (slice(0, 2), slice(2, 4)))
+    assert min(near, far) > 0.15 * len(ends)
+    assert near + far >= len(ends)  # one end is there as a whole
+    assert far > near
+    # What is shown, the runway or an end, leaves room around it for the crop to move.
+    for shot in shots:
+        if not shot.empty:
+            width, px = shot.camera.width, shot.corners_px
+            parts = [
+                px[part] for part in (slice(0, 4), slice(0, 2), slice(2, 4)) if inside(px[part], width, width).all()
+            ]
+            assert any(11 <= np.ptp(part, axis=0).max() <= width / 1.29 for part in parts)
+    assert max(sizes) <= 1.3 * 200 + 3
+    # Some show much of the land around a runway that is small in it.
+    spans = [np.ptp(s.corners_px, axis=0).max() / s.camera.width for s in shots if not s.empty]
+    assert np.mean(np.array(spans) < 0.3) > 0.08
+
+
+def test_land_has_no_runway_in_it():
+    land = [shot for shot in (plan_shot(4, n) for n in range(300)) if shot.empty]
+    along, across = np.meshgrid(np.linspace(0, 1, 60), np.linspace(-0.5, 0.5, 7))
+    for shot in land:
+        assert shot.corners_px is None
+        assert not np.asarray(shot.scene.airfield.other).any()
+        runway = shot.scene.runway
+        surface = np.stack([along * runway.length_m, across * runway.width_m, 0 * along], axis=-1).reshape(-1, 3)
+        # Between its ends the runway is flat enough here: a tenth of a pixel at most.
+        px = sf.project(shot.camera, shot.pose, surface)
+        assert not inside(px, shot.camera.width, shot.camera.height).any()
+    assert len({shot.camera.width for shot in land}) > 10
+
+
+def test_a_row_without_a_runway_has_empty_corners_and_all_the_rest(views):
+    rows = rows_of(views)
+    assert [not row["near_left_u"] for row in rows] == [False, False, True, *[False] * 5]
+    assert all(row[name] == "" for name in CORNER_COLUMNS for row in rows[2:3])
+    assert all(row[name] for row in rows for name in row if name != "distortion" and name[-2:] not in ("_u", "_v"))
+    examples = list(read_dataset(views))
+    assert examples[2].corners_px is None
+    assert examples[2].image.std() > 1
+    picture = open_dataset(views).pictures[2]
+    assert picture.labels == ()
+    assert picture.size == examples[2].image.shape[1::-1]
+
+
+def test_crops_are_the_papers_of_lards_camera(crops):
+    """A power of one half of LARD's resolution, the runway inside by 8 px, seen from LARD's own cone."""
+    assert not (crops / "lard.csv").exists()
+    for row, example in zip(rows_of(crops), read_dataset(crops), strict=True):
+        assert example.image.shape == (96, 96, 3)
+        halvings = np.log2(EARTH_STUDIO.fx / float(row["fx"]))
+        assert halvings == pytest.approx(round(halvings), abs=1e-9)
+        assert ((example.corners_px > 7.4) & (example.corners_px < 95 - 7.4)).all()
+    shots = [plan_shot(6, n, EARTH_STUDIO, 96) for n in range(120)]
+    for shot in shots:
+        x, y, z = shot.pose.position_m
+        miles = -x / NAUTICAL_MILE_M
+        assert LARD_CONE.nautical_miles[0] <= miles <= LARD_CONE.nautical_miles[1]
+        assert 2.2 <= np.degrees(np.arctan2(z, AIMING_POINT_M - x)) <= 3.8
+        assert abs(np.degrees(np.arctan2(y, -x))) <= 4
+        assert (
+            np.abs([shot.pose.attitude.yaw_deg, shot.pose.attitude.roll_deg]).max() < 20
+        )  # turned to hold it, at most
+        # Half as many halvings would not do: the runway with its margin is over half of the crop.
+        extent = np.ptp(shot.corners_px, axis=0).max()
+        assert shot.camera.fx == pytest.approx(EARTH_STUDIO.fx) or extent > (96 - 2 * 8) / 2 - 8
+    assert len({round(float(np.log2(EARTH_STUDIO.fx / shot.camera.fx))) for shot in shots}) >= 3
+
+
+def test_a_crop_needs_a_camera_and_its_own_folder(crops, tmp_path):
+    with pytest.raises(sf.InputError, match=r"^crop_px: crops are of a camera's frames; give the camera too$"):
+        write_dataset(tmp_path / "x", 1, crop_px=224)
+    for other in (None, 64):
+        with pytest.raises(sf.InputError, match="holds a data set of another seed, camera or crop"):
+            write_dataset(crops, 3, seed=6, camera=EARTH_STUDIO, crop_px=other)
+
+
+def test_a_data_set_of_views_is_clean(views, tmp_path):
+    """Land without a runway and corners beyond the border are no faults."""
+    report = check_dataset(views, tmp_path)
+    assert report.serious == ()
+    assert (report.pictures, report.labels, report.unlabelled) == (8, 7, 1)
+    assert sorted(p.picture for p in report.problems if p.kind == "cut") == [
+        f"images/00000{k}.png" for k in (3, 5, 6, 7)
+    ]
+    assert len(report.audit.labels) == 7
+    assert not report.audit.not_checked
+    # A runway is as large as it is seen.
+    sizes = {len(read_image(p.path)) for p in open_dataset(views).pictures}
+    assert np.concatenate(list(report.measures["runway_px"].values())).max() <= max(sizes)
+    assert (tmp_path / "contact_sheet.png").stat().st_size > 10_000
 
 
 CAMERA = sf.Camera(160, 160, 222.3, 205.5, 79.5, 79.5, (-0.2, 0.05, 0.0, 0.0))
@@ -130,7 +273,7 @@ def test_another_seed_is_not_mixed_in(folder):
     [
         (lambda text: text.replace("near_left_u", "left_u"), "no column near_left_u"),
         (lambda text: "\n".join([*text.splitlines()[:2], text.splitlines()[2].rsplit(",", 1)[0] + ",nan"]),
-         "line 3: far_left_v is 'nan'"),
+         "line 3: aiming_far_left_v is 'nan'"),
         (lambda text: text.splitlines()[0], "a header without rows"),
     ],
 )  # fmt: skip
@@ -152,11 +295,26 @@ def test_a_missing_or_broken_picture_is_named(folder, tmp_path):
         read_dataset(tmp_path / "nowhere")
 
 
-def test_other_peoples_formats_are_examples_too(folder, tmp_path):
-    convert(folder, tmp_path / "yolo", "yolo")
-    truth = {Path(picture.name).name: corners for picture, corners in read_dataset(folder).labels}
-    for picture, corners in read_dataset(tmp_path / "yolo").labels:
-        np.testing.assert_allclose(corners, truth[Path(picture.name).name], atol=1e-5)
+@pytest.mark.parametrize("to", ["yolo", "coco"])
+def test_other_peoples_formats_are_examples_too(views, tmp_path, to):
+    pytest.importorskip("yaml")
+    convert(views, tmp_path / to, to)
+    truth = {Path(picture.name).name: label and label.corners_px for picture, label in read_dataset(views).labels}
+    there = read_dataset(tmp_path / to)
+    assert len(there) == len(truth) == 8
+    for (picture, label), example in zip(there.labels, there, strict=True):
+        name = Path(picture.name).name
+        if truth[name] is None:
+            assert label is None
+            assert example.corners_px is None
+            continue
+        corners = np.where(label.visible[:4, None] > 0, label.keypoints_px[:4], np.nan)
+        seen = inside(truth[name], *example.image.shape[1::-1])
+        # YOLO has no room for a corner beyond the border: there it is not labelled.
+        kept = seen if to == "yolo" else np.ones(4, bool)
+        np.testing.assert_allclose(corners[kept], truth[name][kept], atol=1e-5)
+        assert np.isnan(corners[~kept]).all()
+        np.testing.assert_array_equal(example.corners_px, corners)
 
 
 @pytest.mark.skipif(not LARD_SAMPLE.is_dir(), reason="shared/data is absent")

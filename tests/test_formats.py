@@ -298,6 +298,36 @@ def test_rendered_scenes_become_coco_and_yolo(tmp_path):
             np.testing.assert_allclose(px, one.labels[0].keypoints_px, atol=tolerance)
 
 
+def test_pictures_without_a_runway_and_corners_beyond_the_border_are_kept(tmp_path):
+    """Of eight views, the third is of land and four show one end only (test_dataset.py)."""
+    pytest.importorskip("yaml")
+    write_dataset(tmp_path / "d", 8, seed=5)
+    source = {p.path.name: p for p in open_dataset(tmp_path / "d").pictures}
+    assert [len(p.labels) for p in source.values()] == [1, 1, 0, 1, 1, 1, 1, 1]
+    for to in ("coco", "yolo"):
+        result = convert(tmp_path / "d", tmp_path / to, to, fractions=(0.5, 0.5))
+        assert (result.pictures, result.labels, result.refused) == (8, 7, ())
+        assert result.splits == {"train": 4, "val": 4}
+        there = {p.path.name: p for p in open_dataset(tmp_path / to).pictures}
+        assert there.keys() == source.keys()
+        beyond = 0
+        for name, one in source.items():
+            assert len(there[name].labels) == len(one.labels)
+            for label, other in zip(one.labels, there[name].labels):
+                assert other.names == label.names
+                share = (label.keypoints_px + 0.5) / one.size
+                outside = ((share < 0) | (share > 1)).any(axis=1)
+                beyond += outside.sum()
+                lost = outside if to == "yolo" else np.zeros(8, bool)
+                assert (other.visible == np.where(lost, 0, label.visible)).all()
+                kept = other.visible > 0
+                np.testing.assert_allclose(other.keypoints_px[kept], label.keypoints_px[kept], atol=1e-6)
+        assert beyond >= 8
+        assert result.outside == (beyond if to == "yolo" else 0)
+    text = (tmp_path / "yolo" / "labels").rglob("000002.txt")
+    assert [file.read_text() for file in text] == [""]  # how YOLO says that there is nothing
+
+
 def test_equal_names_do_not_overwrite_one_another(tmp_path):
     names = ["x/a.png", "y/a.png", "a.jpg", "x_a.png"]
     for k, name in enumerate(names):
@@ -389,6 +419,14 @@ def test_every_split_gets_an_airport():
     pictures = at("BIG", 1000) + at("AAA", 1) + at("BBB", 1)
     splits = split_by_airport(pictures, (0.9, 0.05, 0.05))
     assert sorted({split: splits.count(split) for split in splits}.values()) == [1, 1, 1000]
+
+
+def test_pictures_without_a_runway_go_one_by_one():
+    land = [Picture(Path(f"land{k}.png"), f"land{k}", "", None, ()) for k in range(40)]
+    splits = split_by_airport(at("AAA", 30) + at("BBB", 30) + land, (0.5, 0.5))
+    assert len(set(splits[:30])) == len(set(splits[30:60])) == 1
+    assert splits[0] != splits[30]
+    assert sorted((splits[60:].count("train"), splits[60:].count("val"))) == [20, 20]
 
 
 @pytest.mark.parametrize(
@@ -575,10 +613,13 @@ def test_rows_of_our_own_table_are_refused_one_by_one(tmp_path):
     write_dataset(tmp_path, 3, seed=3)
     header, first, second, third = (tmp_path / "labels.csv").read_text().splitlines()
     bad = [second.rsplit(",", 1)[0] + ",nan", third.rsplit(",", 1)[0], first.replace("images/000000.png", "")]
+    bad += [second.rsplit(",", 1)[0] + ","]  # seven numbers of eight are not no runway
     (tmp_path / "labels.csv").write_text("\n".join([header, first, *bad]))
     data = open_dataset(tmp_path)
     assert len(data.pictures) == 1
-    assert [(p.row, p.field) for p in data.refused] == [("line 3", "far_left_v"), ("line 4", ""), ("line 5", "image")]
+    assert [(p.row, p.field) for p in data.refused] == [
+        ("line 3", "aiming_far_left_v"), ("line 4", ""), ("line 5", "image"), ("line 6", "aiming_far_left_v"),
+    ]  # fmt: skip
 
 
 @pytest.mark.skipif(not (DATA / "lard_sample").exists(), reason="shared/data is not here: no real LARD labels to read")

@@ -7,7 +7,9 @@ import pytest
 import shortfinal as sf
 from shortfinal.crops import box_around
 from shortfinal.demo import CAMERA, RUNWAY, Fault, approach_pose, demo_scene, inject, render_frame
+from shortfinal.detector import Look
 from shortfinal.integrity import Decision
+from shortfinal.keypoints import AIMING_NAMES
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +123,66 @@ def test_noise_is_hardly_ever_accepted(pipeline):
         result = pipeline.step(noise, box=[left, top, left + side, top + 0.7 * side])
         accepted += result.verdict.decision is Decision.USE
     assert accepted <= 3
+
+
+def test_a_near_runways_far_end_is_looked_at_again_and_seen_sharper(pipeline, frame):
+    result = pipeline.step(frame, box=BOX)
+    corners = sf.project(CAMERA, TRUTH, RUNWAY.corners)
+    assert any(
+        (crop.apply(corners[2:]) > 0).all() and (crop.apply(corners[2:]) < 223).all() for crop in result.end_crops
+    )
+    assert all(crop.scale[0] > 1.5 * result.crop.scale[0] for crop in result.end_crops)
+    one_look = pipeline.detector.detect(frame, result.crop)
+    assert (result.keypoints.sigma_px[2:] < one_look.sigma_px[2:]).all()
+    # What two looks say is independent.
+    assert not result.keypoints.cov_px[:4, 4:].any()
+    assert result.to_dict()["end_crops"] == [[c.left, c.top, c.width, c.height] for c in result.end_crops]
+
+
+def test_a_runway_that_is_small_in_the_frame_is_looked_at_once(pipeline):
+    # From 3 km a crop around one end would hardly enlarge it; from nearer it does.
+    truth = approach_pose(0)
+    result = pipeline.step(render_frame(demo_scene(), 0), box=box_around(sf.project(CAMERA, truth, RUNWAY.corners)))
+    assert result.crop is not None
+    assert all(crop.scale[0] > 1.5 * result.crop.scale[0] for crop in result.end_crops)
+
+
+def test_land_without_a_runway_is_said_to_be_none(pipeline):
+    # The demo's land beside the airfield, looked at as if a runway lay there.
+    frame = render_frame(demo_scene(), 80)
+    result = pipeline.step(frame, box=[20.0, 480.0, 180.0, 600.0])
+    assert result.verdict.decision is Decision.NOT_MONITORED
+    assert result.present < 0.5
+    assert "no runway in view" in result.verdict.reasons[0]
+    assert result.estimate is None
+
+
+class Told:
+    """A detector that says what it is told: eight keypoints, of which it sees some."""
+
+    calibration = None
+
+    def __init__(self, info, mean_px, visible):
+        self.info = dataclasses.replace(info, keypoints=(*sf.CORNER_NAMES, *AIMING_NAMES))
+        self.mean_px, self.visible = mean_px, visible
+
+    def look(self, image, window):
+        return Look(window, sf.GaussianKeypoints.from_sigma(self.mean_px, 0.3), self.visible, 1.0)
+
+    def look_all(self, image, windows):
+        return [dataclasses.replace(self.look(image, w), visible=np.zeros(8)) for w in windows]
+
+
+def test_further_keypoints_take_part_as_far_as_they_are_seen(pipeline, frame):
+    marking = np.array([[300.0, 12, 0], [300, -12, 0], [350, -12, 0], [350, 12, 0]])
+    mean = sf.project(CAMERA, TRUTH, np.vstack([RUNWAY.corners, marking]))
+    detector = Told(pipeline.detector.info, mean, np.array([1, 1, 1, 1, 1, 0.2, 1, 0.9]))
+    with pytest.raises(sf.InputError, match="expected near-left"):
+        sf.LandingPipeline(detector, RUNWAY, CAMERA)
+    result = sf.LandingPipeline(detector, RUNWAY, CAMERA, further_points=marking).step(frame, box=BOX)
+    assert len(result.keypoints.mean_px) == 7
+    assert result.verdict.dof == 2 * 7 - 6
+    assert np.linalg.norm(result.estimate.pose.position_m - TRUTH.position_m) < 0.01
 
 
 def test_a_flat_frame_is_not_looked_into(pipeline):

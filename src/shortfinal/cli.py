@@ -42,6 +42,8 @@ app = typer.Typer(
 )  # fmt: skip
 data_app = typer.Typer(no_args_is_help=True, help="Data sets.")
 app.add_typer(data_app, name="data")
+reproduce_app = typer.Typer(no_args_is_help=True, help="The paper's tables again (arXiv 2508.09732).")
+app.add_typer(reproduce_app, name="reproduce")
 
 console = Console()
 _STYLES = {"use": "green", "do-not-use": "bold red", "not-monitored": "yellow"}
@@ -212,39 +214,99 @@ def solve(
 
 @app.command()
 def train(
-    data: Annotated[Path, typer.Option(help="Data set to train on: rendered, or LARD's, COCO keypoints, YOLO-pose.")],
-    validation: Annotated[Path, typer.Option(help="Held-out data set, e.g. rendered with another seed.")],
-    out: Out = Path("runs/latest"),
-    backbone: Annotated[str, typer.Option(help="Any timm model.")] = "mobilenetv3_small_100",
-    steps: Annotated[int, typer.Option(help="Batches to train on.", min=1)] = 10000,
-    batch: Annotated[int, typer.Option(min=2)] = 32,
-    learning_rate: Annotated[float, typer.Option(min=0)] = 2e-3,
-    validate_every: Annotated[int, typer.Option(help="Steps between validations and checkpoints.", min=1)] = 500,
-    workers: Annotated[int, typer.Option(help="Processes that prepare crops.", min=0)] = 1,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-) -> None:  # fmt: skip
-    """Train a network on rendered scenes; run again with the same --out to go on after a stop."""
-    from shortfinal.train.fit import Recipe
+    recipe: Annotated[Path | None, typer.Argument(help="Recipe (TOML); see examples/recipe.toml.")] = None,
+    data: Annotated[
+        list[Path] | None, typer.Option(help="Training pictures: rendered, or LARD's, COCO keypoints, YOLO-pose.")
+    ] = None,
+    validation: Annotated[
+        list[Path] | None, typer.Option(help="Held-out ones, e.g. rendered with another seed.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the checkpoints.")] = None,
+    preset: Annotated[
+        str, typer.Option(help="default, paper-resnet or paper-efficientnet; without a recipe.")
+    ] = "default",
+    change: Annotated[
+        list[str] | None, typer.Option("--set", help="Any field of the recipe: --set steps=20000.")
+    ] = None,
+) -> None:
+    """Train a network; run again with the same --out to go on after a stop. `torchrun` shares it among processes."""
     from shortfinal.train.fit import train as fit
+    from shortfinal.train.recipe import make_recipe, parse_change, read_recipe
 
-    recipe = Recipe(
-        str(data), str(validation), str(out), backbone=backbone, steps=steps, batch=batch, learning_rate=learning_rate,
-        validate_every=validate_every, workers=workers, seed=seed,
-    )  # fmt: skip
-    figures = fit(recipe, console)
-    console.print(f"best checkpoint: {out}/best.pt, " + ", ".join(f"{k} {v:.3f}" for k, v in figures.items()))
+    changes = dict(parse_change(text) for text in change or ())
+    for name, folders in (("data", data), ("validation", validation)):
+        if folders:
+            changes[name] = [str(folder) for folder in folders]
+    if out:
+        changes["out"] = str(out)
+    made = read_recipe(recipe, changes) if recipe else make_recipe(preset, changes)
+    figures = fit(made, console)
+    console.print(f"best checkpoint: {made.out}/best.pt, " + ", ".join(f"{k} {v:.3f}" for k, v in figures.items()))
 
 
 @app.command()
 def export(
     checkpoint: Annotated[Path, typer.Argument(help="best.pt of a training run.")],
     out: Annotated[Path, typer.Argument(help="Model file to write (.onnx).")],
+    precision: Annotated[Literal["fp32", "fp16", "int8"], typer.Option(help="Of the backbone's arithmetic.")] = "fp32",
+    data: Annotated[Path | None, typer.Option(help="Data set to compare on, and to set int8's ranges.")] = None,
 ) -> None:
     """Write a checkpoint as a model file that describes itself, checked against torch."""
     from shortfinal.train.export import export as write
 
-    info = write(checkpoint, out)
-    console.print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB, {info.backbone}, {info.covariance} covariance)")
+    info = write(checkpoint, out, precision, data)
+    console.print(
+        f"written: {out} ({out.stat().st_size / 1e6:.1f} MB, {info.backbone}, {info.covariance} covariance, "
+        f"{precision}); "
+        f"off torch's by {info.figures['export_mean_px']:.2g} px and {info.figures['export_sigma']:.2%} of sigma"
+    )
+
+
+@app.command()
+def calibrate(
+    model: Annotated[Path, typer.Argument(help="Model file (.onnx).")],
+    data: Annotated[Path, typer.Option(help="Labelled pictures that the network has not seen.")],
+    out: Annotated[Path | None, typer.Option(help="Model file to write; MODEL itself if not given.")] = None,
+    airports: Annotated[list[str] | None, typer.Option(help="Only these, e.g. BIRK or BIRK/01.")] = None,
+) -> None:
+    """Hold a model's sigmas against labelled pictures, and keep in its file what mends them."""
+    from shortfinal.calibrate import calibrate as fit
+
+    with _counter("looking", quiet=False) as seen:
+        made = fit(model, data, out or model, airports, seen)
+    scale = ", ".join(f"{factor:.2f}" for factor in made.sigma_scale)
+    console.print(f"sigma times {scale} (near-left u, v, near-right u, ...), from {made.fitted_on}")
+    console.print(f"written: {out or model}")
+
+
+@reproduce_app.command("table1")
+def reproduce_table1(
+    data: Annotated[list[Path], typer.Option(help="Training pictures, as for train; the paper's are LARD v1's.")],
+    validation: Annotated[
+        list[Path] | None, typer.Option(help="Held-out ones; by default a fifth of the data's airports.")
+    ] = None,
+    out: Out = Path("results/table1"),
+    models: Annotated[str, typer.Option(help="Some of the six, e.g. resnet18,resnet50-sam; all by default.")] = "",
+    epochs: Annotated[float, typer.Option(min=0, help="Passes over the data; the paper's by default.")] = 30.0,
+    change: Annotated[
+        list[str] | None, typer.Option("--set", help="Any field of the recipe: --set likelihood=published.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Table 1: three backbones with the FC and the SAM head, trained alike; run again to go on after a stop."""
+    from shortfinal.train.recipe import parse_change
+    from shortfinal.train.reproduce import markdown
+    from shortfinal.train.reproduce import reproduce_table1 as reproduce
+
+    content = reproduce(
+        [str(folder) for folder in data], out, [str(folder) for folder in validation or ()], _names(models), epochs,
+        dict(parse_change(text) for text in change or ()), Console(stderr=True) if as_json else console,
+    )  # fmt: skip
+    if as_json:
+        _print_json(content | {"out": str(out)})
+        return
+    console.print(markdown(content), markup=False, highlight=False, soft_wrap=True)
+    console.print(f"written: {out}/table1.md, table1.json, table1.png")
 
 
 @app.command()
@@ -285,6 +347,9 @@ def data_render(
     camera: Annotated[
         Path | None, typer.Option(help="Camera (TOML): whole frames as it takes them, instead of views of the runway.")
     ] = None,
+    crop: Annotated[
+        int | None, typer.Option(help="Side, px: of the camera's frames only a crop, as the paper draws it.", min=32)
+    ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Threads; all cores by default.")] = None,
 ) -> None:
     """Render a data set of random approaches with exact labels; run again to go on after a stop."""
@@ -294,7 +359,7 @@ def data_render(
     given = read_camera(camera) if camera else None
     with _bar() as bar:
         task = bar.add_task("rendering", total=count)
-        labels = write_dataset(out, count, seed, workers, lambda _: bar.advance(task), given)
+        labels = write_dataset(out, count, seed, workers, lambda _: bar.advance(task), given, crop)
     console.print(f"written: {labels}")
 
 

@@ -7,24 +7,30 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shortfinal.calibration import Calibration
 from shortfinal.errors import InputError
-from shortfinal.geometry import PixelWindow
-from shortfinal.keypoints import GaussianKeypoints
+from shortfinal.geometry import PixelWindow, frozen
+from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
 
+Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Ints = NDArray[np.int_]
 
 METADATA_KEY = "shortfinal"
-FORMAT = 1
+FORMAT = 2
+OUTPUTS = ("mean_px", "cov_px", "visible", "present")
+COVARIANCES = ("diagonal", "keypoint", "full")
+Precision = Literal["fp32", "fp16", "int8"]
 
 
 @dataclass(frozen=True)
@@ -35,12 +41,14 @@ class ModelInfo:
     size: int  # side of the square input, px
     mean: tuple[float, float, float]  # subtracted from RGB / 255
     std: tuple[float, float, float]  # then divided by
-    keypoints: tuple[str, ...]  # names, in order
-    covariance: str  # "diagonal": what the network predicts of the (2K, 2K) covariance it returns
+    keypoints: tuple[str, ...]  # names, in order; the four corners first
+    covariance: str  # what is predicted of it: the "diagonal", the blocks of each "keypoint", or the "full" matrix
     margin: float  # the crop it works best with: side of the crop over longer side of the runway's box
     backbone: str
+    precision: Precision  # of the backbone's arithmetic
     training: dict[str, Any]  # data, steps, seed
     figures: dict[str, float]  # errors (px of the input) and coverage on the held-out scenes
+    calibration: Calibration | None  # how the network's sigma is mended; None: not at all
 
     @classmethod
     def from_json(cls, text: str, source: str) -> ModelInfo:
@@ -59,6 +67,11 @@ class ModelInfo:
         values = {f.name: content[f.name] for f in fields(cls)}
         for name in ("mean", "std", "keypoints"):
             values[name] = tuple(values[name]) if isinstance(values[name], list) else ()
+        if values["calibration"] is not None:
+            try:
+                values["calibration"] = Calibration.from_plain(values["calibration"])
+            except InputError as error:
+                raise InputError(f"{source}: {error}; calibrate it again") from error
         info = cls(**values)
         wrong = info.first_wrong_field()
         if wrong:
@@ -71,49 +84,94 @@ class ModelInfo:
             "size": type(self.size) is int and 16 <= self.size <= 4096,
             "mean": len(self.mean) == 3 and all(_is_number(v) for v in self.mean),
             "std": len(self.std) == 3 and all(_is_number(v) and v > 0 for v in self.std),
-            "keypoints": len(self.keypoints) > 0 and all(isinstance(name, str) for name in self.keypoints),
-            "covariance": isinstance(self.covariance, str),
+            "keypoints": self.keypoints[:4] == CORNER_NAMES and all(isinstance(name, str) for name in self.keypoints),
+            "covariance": self.covariance in COVARIANCES,
             "margin": _is_number(self.margin) and 1 <= self.margin <= 10,
+            "backbone": isinstance(self.backbone, str),
+            "precision": self.precision in get_args(Precision),
+            "training": isinstance(self.training, dict),
+            "figures": isinstance(self.figures, dict) and all(map(_is_number, self.figures.values())),
+            "calibration": self.calibration is None or len(self.calibration.sigma_scale) == 2 * len(self.keypoints),
         }
         return next((name for name, fine in checks.items() if not fine), "")
 
     def to_json(self) -> str:
         """The text `from_json` reads."""
-        return json.dumps(asdict(self))
+        calibration = self.calibration and self.calibration.to_plain()
+        return json.dumps({**asdict(replace(self, calibration=None)), "calibration": calibration})
 
 
 def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-class KeypointDetector:
-    """A model file, loaded. `detect` turns an image and a crop into keypoints in the image's pixels."""
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What the network says of one window of an image."""
 
-    def __init__(self, path: str | Path | None = None, threads: int = 0) -> None:
+    window: PixelWindow
+    keypoints: GaussianKeypoints  # in the image's pixels
+    visible: Array  # (K,) probability that the keypoint is in the window
+    present: float  # probability that a runway is
+
+
+class KeypointDetector:
+    """A model file, loaded. `look` turns an image and a window of it into keypoints in the image's pixels."""
+
+    def __init__(self, path: str | Path | None = None, threads: int = 0, calibrated: bool = True) -> None:
         """Load `path`, or the model that ships with the package. `threads`: 0 for all cores.
 
-        Raises InputError if the file is missing, is no ONNX model, or does not describe itself.
+        Sigmas are mended as the file's calibration says, if it has one; not `calibrated`, they are as
+        the network gives them. Raises InputError if the file is missing, is no ONNX model, or does not
+        describe itself.
         """
         self._session, self.info = _load(path, threads)
+        self.calibration = self.info.calibration if calibrated else None
+        scale = self.calibration.sigma_scale if self.calibration else ()
+        self._gain = np.outer(scale, scale) if scale else None  # of the covariance: D C D, D diagonal
 
     def detect(self, image: Image, window: PixelWindow) -> GaussianKeypoints:
-        """Keypoints in the pixels of `image` (h, w, 3; RGB, uint8), found within `window`.
+        """The keypoints of `look`."""
+        return self.look(image, window).keypoints
+
+    def look(self, image: Image, window: PixelWindow) -> Look:
+        """What the network sees within `window` of `image` (h, w, 3; RGB, uint8).
 
         The window must have the model's input size. Raises InputError for another image type or
         window, and when the network's answer is not a Gaussian (non-finite).
         """
+        return self.look_all(image, [window])[0]
+
+    def look_all(self, image: Image, windows: Sequence[PixelWindow]) -> list[Look]:
+        """What it sees within several windows of one image, from one call of the network; as `look`."""
         check_image(image)
-        if (window.out_width, window.out_height) != (self.info.size, self.info.size):
-            raise InputError(
-                f"window: {window.out_width} x {window.out_height}; the model takes {self.info.size} x {self.info.size}"
-            )
-        batch = normalise(crop_image(image, window), self.info.mean, self.info.std)[None]
+        info = self.info
+        batch = np.empty((len(windows), 3, info.size, info.size), np.float32)
+        for pixels, window in zip(batch, windows, strict=True):
+            if (window.out_width, window.out_height) != (info.size, info.size):
+                raise InputError(
+                    f"window: {window.out_width} x {window.out_height}; the model takes {info.size} x {info.size}"
+                )
+            normalise(crop_image(image, window), info.mean, info.std, out=pixels)
+        if not windows:
+            return []
         try:
-            answer = self._session.run(["mean_px", "cov_px"], {"image": batch})
+            answers = self._session.run(OUTPUTS, {"image": batch})
         except Exception as error:  # ONNX Runtime has no common base class for what it raises
             raise InputError(f"the model failed: {str(error).splitlines()[0][:120]}") from error
-        mean, cov = (np.asarray(out[0], np.float64) for out in answer)
-        return GaussianKeypoints(window.inverse(mean), window.inverse_cov(cov))
+        return [self._look(window, *answer) for window, *answer in zip(windows, *answers, strict=True)]
+
+    def _look(self, window: PixelWindow, mean: Any, cov: Any, visible: Any, present: Any) -> Look:
+        """One answer, float32, in the image's pixels."""
+        probabilities = np.append(visible, present).astype(np.float64)
+        if not ((probabilities >= 0) & (probabilities <= 1)).all():
+            raise InputError(f"the model answers {probabilities.tolist()} where probabilities are expected")
+        cov = cov.astype(np.float64)
+        cov = (cov + cov.T) / 2  # equal but for the rounding of float32
+        if self._gain is not None:
+            cov *= self._gain
+        keypoints = GaussianKeypoints(window.inverse(mean), window.inverse_cov(cov))
+        return Look(window, keypoints, frozen(probabilities[:-1]), float(present))
 
 
 def check_image(image: Image) -> None:
@@ -181,10 +239,17 @@ def _block_means(image: Image, origin: Ints, needed: Ints, shrink: Ints, border:
     return np.asarray(cv2.resize(inside, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8), first
 
 
-def normalise(crop: Image, mean: tuple[float, ...], std: tuple[float, ...]) -> NDArray[np.float32]:
-    """RGB (h, w, 3) uint8 to the network's input (3, h, w): (RGB / 255 - mean) / std."""
-    scaled = (crop.astype(np.float32) / np.float32(255) - np.array(mean, np.float32)) / np.array(std, np.float32)
-    return np.ascontiguousarray(scaled.transpose(2, 0, 1))
+def normalise(
+    crop: Image, mean: tuple[float, ...], std: tuple[float, ...], out: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """RGB (h, w, 3) uint8 to the network's input (3, h, w): (RGB / 255 - mean) / std; into `out` if given."""
+    if out is None:
+        out = np.empty((3, *crop.shape[:2]), np.float32)
+    for plane, channel, centre, spread in zip(out, crop.transpose(2, 0, 1), mean, std, strict=True):
+        np.divide(channel, 255, out=plane, dtype=np.float32)
+        plane -= centre
+        plane /= spread
+    return out
 
 
 def shipped_model() -> Path:
@@ -212,9 +277,22 @@ def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo]:
         )
     info = ModelInfo.from_json(text, str(source))
     shape = tuple(session.get_inputs()[0].shape[1:])
-    outputs = [out.name for out in session.get_outputs()]
-    if shape != (3, info.size, info.size) or not {"mean_px", "cov_px"} <= set(outputs):
-        raise InputError(
-            f"{source}: it takes {shape} and gives {', '.join(outputs)}, unlike its description; export it again"
-        )
+    k = len(info.keypoints)
+    outputs = {out.name: tuple(out.shape[1:]) for out in session.get_outputs()}
+    wanted = dict(zip(OUTPUTS, ((k, 2), (2 * k, 2 * k), (k,), ()), strict=True))
+    if shape != (3, info.size, info.size) or any(outputs.get(name) != wanted[name] for name in OUTPUTS):
+        given = ", ".join(f"{name} {sizes}" for name, sizes in outputs.items())
+        raise InputError(f"{source}: it takes {shape} and gives {given}, unlike its description; export it again")
     return session, info
+
+
+def described(model: bytes, info: ModelInfo) -> bytes:
+    """An ONNX file's content with `info` as its description, in place of any it has. Needs the package onnx."""
+    try:
+        import onnx
+    except ModuleNotFoundError as error:
+        raise InputError("writing a model file needs onnx: pip install onnx") from error
+    content = onnx.load_from_string(model)
+    del content.metadata_props[:]
+    content.metadata_props.add(key=METADATA_KEY, value=info.to_json())
+    return bytes(content.SerializeToString())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,22 @@ Array = NDArray[np.float64]
 _FARTHEST_PX = 1e6
 
 CORNER_NAMES = ("near-left", "near-right", "far-right", "far-left")
+# Outer corners of the pair of aiming-point markings, in the same order.
+AIMING_NAMES = ("aiming-near-left", "aiming-near-right", "aiming-far-right", "aiming-far-left")
+
+
+def mirrored(names: Sequence[str]) -> list[int]:
+    """Which keypoint stands in each one's place when the picture is mirrored: left for right and right for left.
+
+    Raises InputError for a name whose mirror image is not among them.
+    """
+    order = []
+    for name in names:
+        other = "-".join({"left": "right", "right": "left"}.get(part, part) for part in name.split("-"))
+        if other not in names:
+            raise InputError(f"keypoints: {name} without {other}, which it becomes in a mirrored picture")
+        order.append(list(names).index(other))
+    return order
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +90,12 @@ class GaussianKeypoints:
     def whitening(self) -> Array:
         """L⁻¹ (2K, 2K) with L Lᵀ the covariance: it turns residuals into unit normals."""
         return np.linalg.inv(np.linalg.cholesky(self.cov_px))
+
+    def only(self, chosen: ArrayLike) -> GaussianKeypoints:
+        """Those of the keypoints that `chosen` (K,), true or false, says; the others are marginalised out."""
+        keep = np.asarray(chosen, bool)
+        rows = np.repeat(keep, 2)
+        return self if keep.all() else GaussianKeypoints(self.mean_px[keep], self.cov_px[np.ix_(rows, rows)])
 
     def block(self, k: int) -> Array:
         """Covariance (2, 2) of keypoint k, for its ellipse."""

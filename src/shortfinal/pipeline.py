@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shortfinal.crops import box_around, centre_crop
-from shortfinal.detector import Image, KeypointDetector, check_image, crop_image
+from shortfinal.detector import Image, KeypointDetector, Look, check_image, crop_image
 from shortfinal.errors import InputError
 from shortfinal.geometry import Camera, PixelWindow, Pose, as_array, project
 from shortfinal.integrity import FALSE_ALARM_RATE, Decision, IntegrityVerdict, check_integrity, check_rate
@@ -26,6 +26,10 @@ T = TypeVar("T")
 
 WIDE_MARGIN = 1.9  # of the first crop around a prior pose: the widest that training uses
 LOOKS = 3  # crops at most, for a frame
+PRESENT = 0.5  # probability of a runway below which there is none, and of a corner below which it is not seen
+ENDS = (slice(0, 2), slice(2, 4))  # the keypoints of the near end and of the far one
+END_MARGIN = 1.6  # of the crop around one end: its side over the end's width, beside the first look's doubt
+SHARPER = 1.5  # an end is looked at again where that enlarges it by so much
 FLAT = 1.5  # standard deviation of a crop's levels, of 255, below which nothing can be in it
 
 
@@ -34,12 +38,16 @@ class FrameResult:
     """All that is known of one frame. What could not be done is None, and `verdict.reasons` says why."""
 
     timestamp_s: float
-    crop: PixelWindow | None  # where the detector looked
+    crop: PixelWindow | None  # where the detector looked for the whole runway
     keypoints: GaussianKeypoints | None  # in the frame's pixels
     estimate: PoseEstimate | None
     verdict: IntegrityVerdict
     protection: ProtectionLevels | None = None  # what bounds the error of an accepted frame; None if not monitored
     timings: dict[str, float] = field(default_factory=dict)  # "detect_ms", "solve_ms", "doubt_ms"
+    present: float | None = None  # probability that a runway is in the crop
+    end_crops: tuple[PixelWindow, ...] = ()  # where it looked again, for one end each
+    calibrated_on: str | None = None  # what the keypoints' sigma was mended with; None: it is the network's own
+    bounds_95_px: Array | None = None  # (K, 2) split-conformal: 95 % of the errors are no larger; None: not calibrated
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON. Lengths in metres, angles in degrees, pixels of the frame."""
@@ -53,10 +61,15 @@ class FrameResult:
             "timings": {stage: round(ms, 3) for stage, ms in self.timings.items()},
         }
         if self.crop is not None:
-            record["crop"] = [self.crop.left, self.crop.top, self.crop.width, self.crop.height]
+            record["crop"] = _bounds(self.crop)
+            record["end_crops"] = [_bounds(crop) for crop in self.end_crops]
+            record["present"] = self.present
         if self.keypoints is not None:
             record["keypoints_px"] = self.keypoints.mean_px.tolist()
             record["keypoints_cov_px"] = self.keypoints.cov_px.tolist()
+            record["calibrated_on"] = self.calibrated_on
+        if self.bounds_95_px is not None:
+            record["bounds_95_px"] = [[b if math.isfinite(b) else None for b in row] for row in self.bounds_95_px]
         if self.estimate is not None:
             record["status"] = self.estimate.status.value
         if self.estimate is not None and self.estimate.pose is not None and self.estimate.cov is not None:
@@ -81,18 +94,24 @@ class LandingPipeline:
         runway: Runway,
         camera: Camera,
         *,
+        further_points: ArrayLike | None = None,
         false_alarm_rate: float = FALSE_ALARM_RATE,
         integrity_risk: float = INTEGRITY_RISK,
         fault_prior: float = FAULT_PRIOR,
     ) -> None:
-        """The last two are for the protection levels, as in `protection_levels`.
+        """`further_points` (K - 4, 3): where the model's keypoints beyond the corners are on this runway, metres;
+        those that are seen take part. The last two are for the protection levels, as in `protection_levels`.
 
-        Raises InputError for a probability outside (0, 1) or a model whose keypoints are not the four corners.
+        Raises InputError for a probability outside (0, 1) or a model that finds other points than these.
         """
-        if detector.info.keypoints != CORNER_NAMES:
+        further = np.empty((0, 3)) if further_points is None else as_array(further_points, (None, 3), "further_points")
+        names = detector.info.keypoints
+        if names[:4] != CORNER_NAMES or len(names) != 4 + len(further):
             raise InputError(
-                f"detector: its keypoints are {', '.join(detector.info.keypoints)}; expected {', '.join(CORNER_NAMES)}"
+                f"detector: its keypoints are {', '.join(names)}; expected {', '.join(CORNER_NAMES)}"
+                + (f" and {len(further)} further_points" if len(further) else "")
             )
+        self.points = np.vstack([runway.corners, further])
         for name, rate in (
             ("false_alarm_rate", false_alarm_rate), ("integrity_risk", integrity_risk), ("fault_prior", fault_prior)
         ):  # fmt: skip
@@ -126,20 +145,29 @@ class LandingPipeline:
             raise InputError(f"timestamp_s: {timestamp_s}; it must be finite")
         timings: dict[str, float] = {}
         try:
-            crop, keypoints, obstacle = _timed(timings, "detect_ms", lambda: self._look(frame_rgb, box, prior))
+            sight = _timed(timings, "detect_ms", lambda: self._look(frame_rgb, box, prior))
         except InputError as error:
             return FrameResult(timestamp_s, None, None, None, self._not_monitored(str(error)), None, timings)
-        if obstacle:
-            return FrameResult(timestamp_s, crop, keypoints, None, self._not_monitored(obstacle), None, timings)
-        estimate, verdict, protection = self.judge(keypoints, timings)
-        return FrameResult(timestamp_s, crop, keypoints, estimate, verdict, protection, timings)
+        seen = (sight.look.present, sight.end_crops, *self._bounds(sight))
+        crop, keypoints = sight.look.window, sight.keypoints.only(sight.seen)
+        if sight.obstacle:
+            verdict = self._not_monitored(sight.obstacle)
+            return FrameResult(timestamp_s, crop, keypoints, None, verdict, None, timings, *seen)
+        estimate, verdict, protection = self.judge(keypoints, timings, self.points[sight.seen])
+        return FrameResult(timestamp_s, crop, keypoints, estimate, verdict, protection, timings, *seen)
 
     def judge(
-        self, keypoints: GaussianKeypoints, timings: dict[str, float] | None = None
+        self,
+        keypoints: GaussianKeypoints,
+        timings: dict[str, float] | None = None,
+        points: ArrayLike | None = None,
     ) -> tuple[PoseEstimate, IntegrityVerdict, ProtectionLevels | None]:
-        """Solve and doubt: from keypoints in the frame's pixels, whoever found them."""
+        """Solve and doubt: from keypoints in the frame's pixels, whoever found them, of `points` (K, 3) of the
+        runway: the corners, if not given.
+        """
         timings = {} if timings is None else timings
-        estimate = _timed(timings, "solve_ms", lambda: estimate_pose(keypoints, self.runway.corners, self.camera))
+        places = self.runway.corners if points is None else points
+        estimate = _timed(timings, "solve_ms", lambda: estimate_pose(keypoints, places, self.camera))
         verdict, protection = _timed(timings, "doubt_ms", lambda: self._doubt(estimate))
         if verdict.decision is Decision.USE:
             self._last = estimate.pose
@@ -156,13 +184,18 @@ class LandingPipeline:
             false_alarm_rate=self.false_alarm_rate,
         )
 
+    def _bounds(self, sight: _Sight) -> tuple[str | None, Array | None]:
+        calibration = self.detector.calibration
+        if calibration is None:
+            return None, None
+        bounds = calibration.conformal_bounds_px(sight.keypoints.sigma_px, 0.95)
+        return calibration.fitted_on, bounds[sight.seen]
+
     def _not_monitored(self, reason: str) -> IntegrityVerdict:
         return IntegrityVerdict(Decision.NOT_MONITORED, (reason,), 0, self.false_alarm_rate)
 
-    def _look(
-        self, frame: Image, box: ArrayLike | None, prior: Pose | None
-    ) -> tuple[PixelWindow, GaussianKeypoints, str]:
-        """Crop and detect; again where the runway was found, until the crop frames it; what is in the way, or "".
+    def _look(self, frame: Image, box: ArrayLike | None, prior: Pose | None) -> _Sight:
+        """Crop and detect; again where the runway was found, until the crop frames it; then at each end.
 
         A network must name four corners, even of a runway that the crop cuts off, and it does so with
         confidence. So what was found counts only if it lies well inside what was looked at.
@@ -172,15 +205,39 @@ class LandingPipeline:
         window = centre_crop(self._first_box(box, prior), wide, size)
         if crop_image(frame, window).std() < FLAT:
             raise InputError("nothing to see: the crop is flat")
-        keypoints = self.detector.detect(frame, window)
+        look = self.detector.look(frame, window)
         for _ in range(LOOKS - 1):
-            if _frames(window, keypoints, margin):
+            if _frames(look, margin):
                 break
-            window = centre_crop(box_around(keypoints.mean_px), margin, size)
-            keypoints = self.detector.detect(frame, window)
-        if not _frames(window, keypoints, margin):
-            return window, keypoints, f"the runway does not settle inside the crop in {LOOKS} looks"
-        return window, keypoints, self._cut_off(keypoints)
+            wider = margin if look.visible[:4].min() >= PRESENT else WIDE_MARGIN
+            look = self.detector.look(frame, centre_crop(box_around(look.keypoints.mean_px[:4]), wider, size))
+        if look.present < PRESENT:
+            return _Sight(look, look.keypoints, f"no runway in view (its probability is {look.present:.2g})")
+        if not _frames(look, margin):
+            return _Sight(look, look.keypoints, f"the runway does not settle inside the crop in {LOOKS} looks")
+        keypoints, end_crops = self._sharpened(frame, look)
+        return _Sight(look, keypoints, self._cut_off(keypoints), end_crops)
+
+    def _sharpened(self, frame: Image, look: Look) -> tuple[GaussianKeypoints, tuple[PixelWindow, ...]]:
+        """The keypoints with each end from a look of its own, where that shows it larger; and those looks' windows.
+
+        The crop that holds the whole of a near runway shows its far end, on which the monitor's power
+        rests, a few pixels wide. What two looks say of two ends is taken as independent.
+        """
+        known = look.keypoints
+        windows = {end: _around_end(known, end, self.detector.info.size) for end in range(len(ENDS))}
+        windows = {end: w for end, w in windows.items() if w.scale[0] > SHARPER * look.window.scale[0]}
+        if not windows:
+            return known, ()
+        mean, cov = known.mean_px.copy(), known.cov_px.copy()
+        for end, again in zip(windows, self.detector.look_all(frame, list(windows.values())), strict=True):
+            corners, rows = ENDS[end], slice(2 * ENDS[end].start, 2 * ENDS[end].stop)
+            if again.visible[corners].min() < PRESENT or not _holds(again.window, again.keypoints.mean_px[corners]):
+                continue  # the first look stands
+            mean[corners] = again.keypoints.mean_px[corners]
+            cov[rows], cov[:, rows] = 0.0, 0.0
+            cov[rows, rows] = again.keypoints.cov_px[rows, rows]
+        return GaussianKeypoints(mean, cov), tuple(windows.values())
 
     def _first_box(self, box: ArrayLike | None, prior: Pose | None) -> Array:
         if box is None:
@@ -197,15 +254,51 @@ class LandingPipeline:
         """Which corner is at the frame's border, to within 2 sigma: it may lie beyond, unseen."""
         reach = 2 * keypoints.sigma_px
         last = np.array([self.camera.width - 1, self.camera.height - 1])
-        outside = ((keypoints.mean_px < reach) | (keypoints.mean_px > last - reach)).any(axis=1)
+        outside = ((keypoints.mean_px < reach) | (keypoints.mean_px > last - reach))[:4].any(axis=1)
         if not outside.any():
             return ""
         return f"the {CORNER_NAMES[int(outside.argmax())]} corner lies at the border of the frame, or beyond it"
 
 
-def _frames(window: PixelWindow, keypoints: GaussianKeypoints, margin: float) -> bool:
-    """Whether the crop has the runway inside, with half the intended border, and not much too small."""
-    inside = window.apply(keypoints.mean_px) / (window.out_width - 1)
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    """What was seen of a frame: the look at the whole runway, the keypoints, and what is in the way, if anything."""
+
+    look: Look
+    keypoints: GaussianKeypoints  # all of the model's
+    obstacle: str
+    end_crops: tuple[PixelWindow, ...] = ()
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Which keypoints take part (K,): the corners, and of the further ones those that are in view."""
+        return np.asarray((self.look.visible >= PRESENT) | (np.arange(len(self.look.visible)) < 4))
+
+
+def _around_end(known: GaussianKeypoints, end: int, size: int) -> PixelWindow:
+    """The crop for one end: its width and a half, and three sigma of where it is to either side."""
+    box = box_around(known.mean_px[ENDS[end]])
+    width = max(float((box[2:] - box[:2]).max()), 1.0)
+    centre = (box[:2] + box[2:]) / 2
+    margin = END_MARGIN + 6 * float(known.sigma_px[ENDS[end]].max()) / width
+    return centre_crop(np.concatenate([centre - width / 2, centre + width / 2]), margin, size)
+
+
+def _holds(window: PixelWindow, corners_px: Array) -> bool:
+    """Whether corners (n, 2) lie in the window, 3 % of its side from its borders."""
+    inside = window.apply(corners_px) / (window.out_width - 1)
+    return bool((np.abs(inside - 0.5) < 0.47).all())
+
+
+def _bounds(window: PixelWindow) -> list[float]:
+    return [window.left, window.top, window.width, window.height]
+
+
+def _frames(look: Look, margin: float) -> bool:
+    """Whether the crop has all corners inside, with half the intended border, and the runway not much too small."""
+    if look.visible[:4].min() < PRESENT:
+        return False
+    inside = look.window.apply(look.keypoints.mean_px[:4]) / (look.window.out_width - 1)
     border = (1 - 1 / margin) / 4
     extent = float(np.ptp(inside, axis=0).max())
     return bool((inside > border).all() and (inside < 1 - border).all() and extent > 0.8 / margin)

@@ -7,7 +7,7 @@ dirt, night) is drawn on the crop by EFFECTS; none of it moves a corner.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,17 +15,18 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shortfinal.crops import bogo_crop, box_around, random_margin
+from shortfinal.crops import bogo_crop, box_around, inverse_crop, native_crop, random_margin
 from shortfinal.data.dataset import Example
 from shortfinal.detector import warp_image
 from shortfinal.geometry import PixelWindow
+from shortfinal.keypoints import CORNER_NAMES, mirrored
 from shortfinal.scene.sensor import expose, random_sensor, to_8_bit
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Light = NDArray[np.float32]
 
-MIRRORED, ROTATED, OVERHANGING = 0.5, 0.3, 0.05  # probabilities
+MIRRORED, ROTATED, OVERHANGING, ELSEWHERE, CUT = 0.5, 0.3, 0.05, 0.08, 0.06  # probabilities
 SENSOR_RATE = 0.4  # of random_sensor's effects: the pictures have been through one already
 _MOST_TURN_DEG = 7.0
 _CLEAR_PX = 6.0  # a drop stays this far from the corners before it may bend the picture
@@ -54,10 +55,10 @@ class Warp:
         """The crop (size, size, 3), resampled once; area-averaged where it shrinks."""
         return warp_image(image, self.image_from_crop, (self.size, self.size), self.border)
 
-    def apply(self, corners_px: ArrayLike) -> Array:
-        """The image's corners (4, 2), keypoint order, as the crop's, in keypoint order again."""
-        moved = np.asarray(corners_px, float) @ self.crop_from_image[:, :2].T + self.crop_from_image[:, 2]
-        return moved[[1, 0, 3, 2]] if self.mirrored else moved
+    def apply(self, keypoints_px: ArrayLike, names: Sequence[str] = CORNER_NAMES) -> Array:
+        """The image's keypoints (K, 2) as the crop's, each again in the place of its name."""
+        moved = np.asarray(keypoints_px, float) @ self.crop_from_image[:, :2].T + self.crop_from_image[:, 2]
+        return moved[mirrored(names)] if self.mirrored else moved
 
     def region(self, image: Image) -> tuple[Image, Warp]:
         """The part of the image that the crop shows, and the map from there."""
@@ -71,49 +72,107 @@ class Warp:
         return image[top:bottom, left:right], Warp(matrix, self.size, self.mirrored, self.border)
 
 
+def inside(corners_px: Array, width: float, height: float) -> NDArray[np.bool_]:
+    """Which of the points (K, 2) lie within a picture of that size; none that is not a number does."""
+    last = np.array([width, height]) - 0.5
+    return np.asarray(((corners_px >= -0.5) & (corners_px <= last)).all(axis=1))
+
+
+def within(example: Example) -> Array:
+    """An example's keypoints (K, 2), NaN where they are not in the picture."""
+    height, width = example.image.shape[:2]
+    places = np.full((len(example.names), 2), np.nan) if example.keypoints_px is None else example.keypoints_px
+    return np.where(inside(places, width, height)[:, None], places, np.nan)
+
+
 def random_warp(corners_px: Array, image_size: tuple[int, int], size: int, rng: np.random.Generator) -> Warp:
     """Where a training crop lies: a Bogo crop of random scale, some turned by a few degrees, half of them mirrored.
 
-    Most lie within the image (width, height); few hang over its border, and turned ones may.
+    It holds those of the corners (4, 2) that the image (width, height) does; of an image without any,
+    a random part. Most lie within the image; few hang over its border, and turned ones may.
     """
-    box = box_around(corners_px)
+    seen = corners_px[inside(corners_px, *image_size)]
+    if len(seen) < 2:
+        seen = _somewhere(image_size, rng)
+    box = box_around(seen)
     turn_deg, border = 0.0, cv2.BORDER_CONSTANT
     if rng.random() < ROTATED:
         turn_deg = rng.uniform(-_MOST_TURN_DEG, _MOST_TURN_DEG)
         # Not reflected: the mirror image of a runway's end is another end.
         border = cv2.BORDER_REPLICATE if rng.random() < 0.5 else cv2.BORDER_CONSTANT
-    centre = (box[:2] + box[2:]) / 2
-    turn = _turn(centre, turn_deg)
-    turned = corners_px @ turn[:, :2].T + turn[:, 2]
-    box = box_around(turned)
+    turn = _turn((box[:2] + box[2:]) / 2, turn_deg)
+    box = box_around(seen @ turn[:, :2].T + turn[:, 2])
     within = None if rng.random() < OVERHANGING else image_size
     window = bogo_crop(box, random_margin(box, image_size, rng), size, rng, slack=0.02, image_size=within)
+    return _warp(window, turn, border, rng)
+
+
+def beside_warp(corners_px: Array, image_size: tuple[int, int], size: int, rng: np.random.Generator) -> Warp | None:
+    """A crop of the scale of `random_warp`'s without the runway (`inverse_crop`); None where there is no room."""
+    window = inverse_crop(box_around(corners_px), image_size, size, rng)
+    return None if window is None else _warp(window, _STILL, cv2.BORDER_CONSTANT, rng)
+
+
+def native_warp(corners_px: Array, image_size: tuple[int, int], size: int, rng: np.random.Generator) -> Warp:
+    """The paper's crop (`native_crop`), half of them mirrored."""
+    return _warp(native_crop(box_around(corners_px), image_size, rng, size, 0.0), _STILL, cv2.BORDER_CONSTANT, rng)
+
+
+_STILL = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def _warp(window: PixelWindow, turn: Array, border: int, rng: np.random.Generator) -> Warp:
     matrix = _matrix(window) @ np.vstack([turn, [0, 0, 1]])
-    mirrored = bool(rng.random() < MIRRORED)
-    if mirrored:
-        matrix[0] = [0, 0, size - 1] - matrix[0]
-    return Warp(matrix, size, mirrored, border)
+    turned = bool(rng.random() < MIRRORED)
+    if turned:
+        matrix[0] = [0, 0, window.out_width - 1] - matrix[0]
+    return Warp(matrix, window.out_width, turned, border)
 
 
-def augmented_crop(example: Example, size: int, rng: np.random.Generator) -> tuple[Image, Array]:
-    """A random crop (size, size, 3) of an example as another camera in other weather saw it; its corners (4, 2).
+def _somewhere(image_size: tuple[int, int], rng: np.random.Generator) -> Array:
+    """Two corners of a square inside the image."""
+    side = 0.5 * min(image_size)
+    first = rng.uniform(0, np.array(image_size) - 1 - side)
+    return np.array([first, first + side])
 
-    The camera works at the image's resolution, or the crop's where that is coarser: its noise and its
-    JPEG blocks are enlarged with the picture, as in use.
+
+def augmented_crop(
+    example: Example, size: int, rng: np.random.Generator, *, native: bool = False, weather: bool = True
+) -> tuple[Image, Array]:
+    """A random crop (size, size, 3) of an example as another camera in other weather saw it; its keypoints (K, 2).
+
+    Keypoints beyond the crop are given too; those that are not in the picture, or not labelled, are NaN:
+    a crop that hangs over its border shows none of them. The camera works at the image's resolution, or
+    the crop's where that is coarser: its noise and its JPEG blocks are enlarged with the picture, as in
+    use. `native`: the paper's crop, of whole runways only; without `weather` the picture is only cut.
     """
     height, width = example.image.shape[:2]
-    warp = random_warp(example.corners_px, (width, height), size, rng)
+    places = within(example)
+    corners = places[:4]  # which frame the crop
+    whole = bool(np.isfinite(corners).all())
+    beside = None
+    if native and whole:
+        warp = native_warp(corners, (width, height), size, rng)
+    else:
+        if whole and rng.random() < ELSEWHERE:
+            beside = beside_warp(corners, (width, height), size, rng)
+        warp = beside or random_warp(corners, (width, height), size, rng)
+        if beside is None and rng.random() < CUT:  # some corners beyond it, as after a bad guess where to look
+            warp.crop_from_image[:, 2] += rng.uniform(-0.5, 0.5, 2) * size
+    places = warp.apply(places, example.names)
+    if not weather:
+        return warp.cut(example.image), places
     sensor = random_sensor(rng, SENSOR_RATE)
     if warp.scale > 1:
         part, moved = warp.region(example.image)
         crop = moved.cut(expose(part.astype(np.float32), sensor, rng))
     else:
         crop = expose(warp.cut(example.image).astype(np.float32), sensor, rng)
-    corners = warp.apply(example.corners_px)
+    seen = places[inside(places, size, size)]
     for effect in EFFECTS:
         if rng.random() < effect.probability:
-            crop = effect.apply(crop, corners, rng)
-    return crop, corners
+            crop = effect.apply(crop, seen, rng)
+    return crop, places
 
 
 def haze(crop: Image, corners: Array, rng: np.random.Generator) -> Image:
@@ -150,7 +209,7 @@ def drops(crop: Image, corners: Array, rng: np.random.Generator) -> Image:
         left, top = np.maximum(0, centre.astype(int) - reach)
         right, bottom = np.minimum(size, centre.astype(int) + reach + 1)
         part = crop[top:bottom, left:right]
-        bent = np.linalg.norm(corners - centre, axis=1).min() > radius + _CLEAR_PX
+        bent = np.linalg.norm(corners - centre, axis=1).min(initial=np.inf) > radius + _CLEAR_PX
         behind, blur = (part[::-1, ::-1], 0.3 * radius) if bent else (part, 0.8)
         seen = np.asarray(cv2.GaussianBlur(behind, (0, 0), blur), np.float32)
         v, u = np.mgrid[top:bottom, left:right].astype(np.float32)

@@ -61,7 +61,7 @@ MEASURES = {
     "yaw_deg": "yaw, °",
     "pitch_deg": "pitch, °",
     "roll_deg": "roll, °",
-    "runway_px": "runway's box, longer side, px",
+    "runway_px": "runway's box in the picture, longer side, px",
     "brightness": "brightness, grey levels",
 }
 
@@ -242,11 +242,12 @@ def _look_at_label(look: _Look, label: Label, width: int, height: int) -> None:
         return
     corners = look.picture.window(width, height).apply(label.corners_px)
     box = box_around(corners)
-    side = float((box[2:] - box[:2]).max())
+    last = np.array([width, height]) - 0.5
+    shown = np.clip(box.reshape(2, 2), -0.5, last)
+    side = float((shown[1] - shown[0]).max())
     look.measures.append(("runway_px", side))
     if why := _disorder(label.corners_px):
         look.add("order", why, "expected near-left, near-right, far-right, far-left as the pilot sees them", label)
-    last = np.array([width, height]) - 0.5
     if (box[2:] < -0.5).any() or (box[:2] > last).any():
         look.add("outside", "the runway lies outside the picture", "correct or remove the label", label)
     elif (box[:2] < -0.5).any() or (box[2:] > last).any():

@@ -41,13 +41,19 @@ from shortfinal.runway import Runway
 
 Target = Literal["coco", "yolo"]
 
+
+def keypoint_columns(names: Sequence[str]) -> tuple[str, ...]:
+    """Of our own labels.csv: "near_left_u", "near_left_v", ..."""
+    return tuple(f"{name.replace('-', '_')}_{axis}" for name in names for axis in "uv")
+
+
 # Of our own labels.csv.
-CORNER_COLUMNS = tuple(f"{name.replace('-', '_')}_{axis}" for name in CORNER_NAMES for axis in "uv")
+CORNER_COLUMNS = keypoint_columns(CORNER_NAMES)
 CAMERA_COLUMNS = ("width", "height", "fx", "fy", "cx", "cy")
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
-_LARD_COLUMNS = ({"x_A", "y_A", "x_D", "y_D"}, {"x_TL", "y_TL", "x_BR", "y_BR"})
 _ALL_SEEN = np.full(4, 2, np.int8)
 _ALL_SEEN.setflags(write=False)
+_LARD_COLUMNS = ({"x_A", "y_A", "x_D", "y_D"}, {"x_TL", "y_TL", "x_BR", "y_BR"})
 
 
 def open_dataset(
@@ -181,7 +187,7 @@ class _TableRow:
     split: str
     size: tuple[int, int] | None
     resampled: bool
-    label: Label
+    label: Label | None  # None: the picture shows no runway
 
 
 def _pictures(rows: Iterable[_TableRow], root: Path) -> list[Picture]:
@@ -195,7 +201,7 @@ def _pictures(rows: Iterable[_TableRow], root: Path) -> list[Picture]:
             name,
             mine[0].split,
             mine[0].size,
-            tuple(r.label for r in mine),
+            tuple(r.label for r in mine if r.label),
             mine[0].resampled,
         )
         for name, mine in together.items()
@@ -218,9 +224,20 @@ def _problems(refusals: Iterable[Refusal], file: Path) -> list[Problem]:
 
 
 def _own_row(row: Row, given: Camera | None) -> _TableRow:
-    corners = np.array([row.number(name, -LARGEST_PX, LARGEST_PX) for name in CORNER_COLUMNS]).reshape(4, 2)
     camera = given or _own_camera(row)
+    size = (camera.width, camera.height) if camera else None
     image = row.text("image")
+    split = _split_of(row.get("split"), image, Path(row.path))
+    if not any(row.get(name) for name in CORNER_COLUMNS):
+        return _TableRow(image, split, size, False, None)
+    further = [name[:-2].replace("_", "-") for name in row.columns if name.endswith("_u")]
+    names = (*CORNER_NAMES, *(name for name in further if name not in CORNER_NAMES))
+    places, visible = np.full((len(names), 2), np.nan), np.zeros(len(names), np.int8)
+    for k, name in enumerate(names):
+        columns = keypoint_columns([name])
+        if k < 4 or any(row.get(column) for column in columns):  # a further one may be missing
+            places[k] = [row.number(column, -LARGEST_PX, LARGEST_PX) for column in columns]
+            visible[k] = 2
     pose = None
     if all(name in row.columns for name in POSE_COLUMNS):
         numbers = [row.number(name) for name in POSE_COLUMNS]
@@ -230,11 +247,10 @@ def _own_row(row: Row, given: Camera | None) -> _TableRow:
         runway = Runway(row.number("length_m", 0.1, 1e5), row.number("width_m", 0.1, 1e5), row.get("ident"))
     # Every rendered picture is a world of its own.
     label = Label(
-        str(row.path), f"line {row.line}", CORNER_NAMES, frozen(corners), _ALL_SEEN,
+        str(row.path), f"line {row.line}", names, frozen(places), visible,
         row.get("ident").upper(), row.get("scenario") or f"{row.path}: {image}", runway, camera, pose,
     )  # fmt: skip
-    size = (camera.width, camera.height) if camera else None
-    return _TableRow(image, _split_of(row.get("split"), image, Path(row.path)), size, False, label)
+    return _TableRow(image, split, size, False, label)
 
 
 def _own_camera(row: Row) -> Camera | None:
@@ -278,8 +294,9 @@ def split_by_airport(pictures: Sequence[Picture], fractions: Sequence[float], se
     """Per picture train, val or test, so that no airport is in two of them.
 
     Fractions are wanted shares of the pictures. Airports go, largest first and in an order drawn by
-    `seed` among equals, to the split that lacks most. Rendered scenes, which are at no airport, go
-    one by one. Raises InputError for fractions that do not add up to one, or a picture without airport.
+    `seed` among equals, to the split that lacks most. Rendered scenes, which are at no airport, and
+    pictures without a runway go one by one. Raises InputError for fractions that do not add up to one,
+    or a label without airport.
     """
     wanted = dict(zip(SPLITS, fractions, strict=False))
     if len(fractions) > 3 or min(fractions, default=0) < 0 or not abs(sum(fractions) - 1) < 1e-6:
@@ -313,7 +330,7 @@ def split_by_airport(pictures: Sequence[Picture], fractions: Sequence[float], se
 def _group(picture: Picture) -> str:
     airports = sorted({label.airport for label in picture.labels if label.airport})
     scenarios = sorted({label.scenario for label in picture.labels if label.scenario})
-    return next(iter([*airports, *scenarios]), "")
+    return next(iter([*airports, *scenarios]), "" if picture.labels else str(picture.path))
 
 
 # Conversion.

@@ -53,6 +53,14 @@ class Scene(NamedTuple):
         """The airfield's, flat and without a name."""
         return Runway(self.airfield.length, self.airfield.width)
 
+    @property
+    def aiming_marking(self) -> Array | None:
+        """Outer corners (4, 3) of the pair of aiming-point markings, in keypoint order, metres; None if not painted."""
+        begin, length, stripe, inner = self.airfield.aiming
+        far, side = begin + length, min(inner + stripe, 0.5 * self.airfield.width - 2.0)  # as it is painted
+        corners: Array = np.array([[begin, side, 0], [begin, -side, 0], [far, -side, 0], [far, side, 0]])
+        return corners if length > 0 else None
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:

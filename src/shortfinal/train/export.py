@@ -1,110 +1,306 @@
-"""From a checkpoint to the model file: ONNX, with its description inside, checked against torch."""
+"""From a checkpoint to the model file: ONNX, with its description inside, checked against torch.
+
+In fp16 and int8 the backbone is lowered. What locates (the fused map, soft argmax, sigmas) stays in
+float32: a coordinate of 200 px has steps of 1/8 px in fp16.
+"""
 
 from __future__ import annotations
 
+import math
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
+import onnx
+import onnx_ir
+import onnxruntime
 import torch
+from numpy.typing import NDArray
+from onnx import ModelProto, NodeProto
 from torch import Tensor, nn
 
-from shortfinal.detector import FORMAT, METADATA_KEY, ModelInfo
+from shortfinal.calibrate import framed
+from shortfinal.data.dataset import read_dataset
+from shortfinal.detector import FORMAT, OUTPUTS, ModelInfo, Precision, crop_image, described, normalise
 from shortfinal.errors import InputError, JobError
 from shortfinal.files import write_whole
-from shortfinal.keypoints import CORNER_NAMES
-from shortfinal.train.fit import MEAN, STD, load_checkpoint
-from shortfinal.train.model import KeypointNet, to_pixels, variance_px
+from shortfinal.train.fit import load_checkpoint
+from shortfinal.train.model import KeypointNet
 
-# How near ONNX must come to torch, in units of the input's side. (torch itself is off by 4e-6 of it
-# from double precision.)
-TOLERANCE = 1e-5
+Array = NDArray[np.float64]
+Pictures = NDArray[np.float32]  # (N, 3, S, S), normalised
+
+_PICTURES = 200  # of a data set: every other one to set the ranges of int8, the others to compare on
+_FEWEST = 16
+_BATCH = 16
+_TRIES = 8  # of int8: how much of the backbone stays in floating point
+_QUANTISED = ("Conv", "Gemm", "MatMul", "Add", "Relu")
 
 
-class GaussianNet(nn.Module):
-    """What the model file computes: means (B, K, 2) and covariance (B, 2K, 2K) in input pixels."""
+class Difference(NamedTuple):
+    """How far a model file is from torch, as root mean squares."""
 
-    def __init__(self, net: KeypointNet, size: int) -> None:
+    mean_px: float
+    sigma: float  # relative, or of correlations if that is more
+    probability: float
+
+    def within(self, limit: Difference) -> bool:
+        """Whether no part exceeds the limit's, and all are numbers."""
+        return all(mine <= most for mine, most in zip(self, limit, strict=True))
+
+    def __str__(self) -> str:
+        return f"{self.mean_px:.2g} px, {self.sigma:.2%} of sigma, {self.probability:.2g} of probability"
+
+
+# float32: ten times what the rounding of a trained network was (0.0004 px of 224); the others: what may be lost.
+LIMITS: dict[Precision, Difference] = {
+    "fp32": Difference(5e-3, 1e-3, 2e-4),
+    "fp16": Difference(0.05, 0.01, 0.01),
+    "int8": Difference(0.1, 0.05, 0.05),
+}
+
+
+class Network(nn.Module):
+    """What the model file computes."""
+
+    def __init__(self, net: KeypointNet) -> None:
         super().__init__()
-        self.net, self.size = net, size
+        self.net = net
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Means and covariances."""
-        mean, log_variance = self.net(image)
-        variance = variance_px(log_variance).flatten(1)
-        identity = torch.eye(variance.shape[1], dtype=variance.dtype)
-        return to_pixels(mean, self.size), variance[:, :, None] * identity
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pictures (B, 3, S, S) to the file's outputs: (B, K, 2), (B, 2K, 2K), (B, K) and (B,)."""
+        told = self.net(image)
+        return told.mean_px, told.cov_px, told.visible.sigmoid(), told.present.sigmoid()
 
 
-def load_network(checkpoint: str | Path) -> tuple[GaussianNet, dict[str, Any]]:
-    """The averaged network of a checkpoint, ready for inference, and the checkpoint's content."""
+def load_network(checkpoint: str | Path) -> tuple[Network, dict[str, Any]]:
+    """The averaged network of a checkpoint, ready for inference, and the checkpoint's content.
+
+    Raises InputError for a file that is no checkpoint, or whose weights are not of its recipe's network.
+    """
     state = load_checkpoint(checkpoint)
     recipe = state["recipe"]
-    net = KeypointNet(recipe["backbone"], width=recipe["width"])
+    net = KeypointNet(
+        recipe["backbone"], len(recipe["keypoints"]), recipe["head"], recipe["covariance"], recipe["features"],
+        recipe["width"],
+    )  # fmt: skip
     # An averaged model's state is the network's, under "module.", and a count.
     weights = {k.removeprefix("module."): v for k, v in state["average"].items() if k.startswith("module.")}
-    net.load_state_dict(weights)
-    return GaussianNet(net, recipe["size"]).eval(), state
+    try:
+        net.load_state_dict(weights)
+    except RuntimeError as error:
+        raise InputError(f"{checkpoint}: its weights are not those of the network in its recipe") from error
+    return Network(net).eval(), state
 
 
-def export(checkpoint: str | Path, out: str | Path) -> ModelInfo:
-    """Write the checkpoint's network to the ONNX file `out`, and read it back against torch.
+def export(
+    checkpoint: str | Path, out: str | Path, precision: Precision = "fp32", data: str | Path | None = None
+) -> ModelInfo:
+    """Write the checkpoint's network to the ONNX file `out`, and hold it against torch.
 
-    Raises InputError for a file that is no checkpoint; JobError if ONNX Runtime and torch differ
-    by more than `TOLERANCE`, in which case nothing is written.
+    On crops of the data set `data`, else on random pictures. int8 needs one: half of the crops set the
+    ranges of the backbone's layers, the other half compare. Its first layers stay in floating point as
+    far as the `LIMITS` make it necessary. Raises InputError for a file that is no checkpoint, a data set
+    of no use, or an unknown precision; JobError if ONNX Runtime and torch differ by more than the
+    limits. Nothing is written then.
     """
-    import onnx
-
-    model, state = load_network(checkpoint)
-    recipe = state["recipe"]
-    info = ModelInfo(
-        format=FORMAT, size=recipe["size"], mean=MEAN, std=STD, keypoints=CORNER_NAMES, covariance="diagonal",
-        margin=recipe["margin"], backbone=recipe["backbone"],
-        training={"steps": state["step"], "batch": recipe["batch"], "seed": recipe["seed"], "data": "rendered scenes"},
-        figures=state["history"][-1],
-    )  # fmt: skip
-    target = Path(out)
-    with tempfile.TemporaryDirectory(dir=_folder_of(target)) as scratch:
-        draft = Path(scratch) / "model.onnx"
-        example = torch.zeros(2, 3, info.size, info.size)
-        batch = torch.export.Dim("batch", min=1, max=4096)
-        torch.onnx.export(
-            model, (example,), draft, input_names=["image"], output_names=["mean_px", "cov_px"], dynamo=True,
-            dynamic_shapes={"image": {0: batch}}, external_data=False, verbose=False,
-        )  # fmt: skip
-        content = onnx.load(draft)
-        content.metadata_props.add(key=METADATA_KEY, value=info.to_json())
-        content.doc_string = ""
-        for node in content.graph.node:  # the exporter notes where each node stood in the source, paths included
-            del node.metadata_props[:]
-            node.doc_string = ""
-        onnx.save(content, draft)
-        difference = compare(draft, model, info.size)
-        if difference > TOLERANCE:
-            raise JobError(f"{checkpoint}: ONNX Runtime differs from torch by {difference:.1e}; not written")
-        write_whole(target, draft.read_bytes())
+    if precision not in get_args(Precision):
+        raise InputError(f"precision: {precision!r}; expected one of {', '.join(get_args(Precision))}")
+    if precision == "int8" and data is None:
+        raise InputError("data: int8 needs a data set, to see what ranges its layers take")
+    target = _writable(Path(out))
+    network, state = load_network(checkpoint)
+    info = _info(state, precision)
+    pictures = random_pictures(info.size) if data is None else _crops(data, info)
+    model = to_onnx(network, info.size)
+    if precision == "int8":
+        model, difference, share = _quantised(model, network, pictures[::2], pictures[1::2])
+        info.figures["int8_share"] = share
+    else:
+        model = model if precision == "fp32" else _halved(model)
+        difference = compare(model, pictures, answers_of(network, pictures))
+    if not difference.within(LIMITS[precision]):
+        raise JobError(
+            f"{checkpoint}: in {precision} it differs from torch by {difference}; "
+            f"allowed are {LIMITS[precision]}; not written"
+        )
+    info.figures.update({f"export_{name}": value for name, value in difference._asdict().items()})
+    write_whole(target, described(_stripped(model).SerializeToString(), info))
     return info
 
 
-def compare(path: str | Path, model: GaussianNet, size: int, count: int = 16, seed: int = 0) -> float:
-    """Largest difference of means and sigmas from torch's, on random pictures, in units of their side."""
-    import onnxruntime
+def _info(state: dict[str, Any], precision: Precision) -> ModelInfo:
+    recipe = state["recipe"]
+    data = [recipe["data"]] if isinstance(recipe["data"], str) else recipe["data"]
+    training = {name: recipe[name] for name in ("batch", "seed", "head", "features", "width")}
+    return ModelInfo(
+        format=FORMAT, size=recipe["size"], mean=tuple(recipe["mean"]), std=tuple(recipe["std"]),
+        keypoints=tuple(recipe["keypoints"]), covariance=recipe["covariance"], margin=recipe["margin"],
+        backbone=recipe["backbone"], precision=precision,
+        training={"data": [Path(name).name for name in data], "steps": state["step"], **training},
+        figures={name: value for name, value in state["history"][-1].items() if math.isfinite(value)},
+        calibration=None,
+    )  # fmt: skip
 
+
+def to_onnx(network: Network, size: int) -> ModelProto:
+    """The network in float32, for any number of pictures; its nodes still say of which module they are."""
+    batch = torch.export.Dim("batch", min=1, max=4096)
+    program = torch.onnx.export(
+        network, (torch.zeros(2, 3, size, size),), input_names=["image"], output_names=list(OUTPUTS), dynamo=True,
+        dynamic_shapes={"image": {0: batch}}, verbose=False,
+    )  # fmt: skip
+    assert program is not None
+    return program.model_proto
+
+
+def _stripped(model: ModelProto) -> ModelProto:
+    """Without what the exporter notes of each node: where it stood in the source, paths included."""
+    for part in (*model.graph.node, *model.graph.input, *model.graph.output, *model.graph.value_info, model.graph):
+        del part.metadata_props[:]
+        part.doc_string = ""
+    return model
+
+
+def random_pictures(size: int, count: int = 16, seed: int = 0) -> Pictures:
+    """Smooth noise (count, 3, size, size) of unit variance at the nodes of a grid of 8 px."""
     rng = np.random.default_rng(seed)
-    smooth = torch.from_numpy(rng.normal(0, 1, (count, 3, size // 8, size // 8)).astype(np.float32))
-    image = nn.functional.interpolate(smooth, size=(size, size), mode="bilinear")
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    got_mean, got_cov = session.run(["mean_px", "cov_px"], {"image": image.numpy()})
+    coarse = torch.from_numpy(rng.normal(0, 1, (count, 3, size // 8, size // 8)).astype(np.float32))
+    return np.asarray(nn.functional.interpolate(coarse, size=(size, size), mode="bilinear"))
+
+
+def _crops(data: str | Path, info: ModelInfo) -> Pictures:
+    """Runways of a data set, framed as in use."""
+    examples = read_dataset(data)
+    crops = []
+    for n in range(0, len(examples), max(1, len(examples) // _PICTURES)):
+        example = examples[n]
+        window = None if example.corners_px is None else framed(example.image, example.corners_px, info)
+        if window is not None:
+            crops.append(normalise(crop_image(example.image, window), info.mean, info.std))
+    if len(crops) < _FEWEST:
+        raise InputError(f"{data}: {len(crops)} runways; at least {_FEWEST} are needed to compare on")
+    return np.stack(crops)
+
+
+def answers_of(network: Network, pictures: Pictures) -> list[Array]:
+    """What torch answers: the arrays of OUTPUTS."""
     with torch.inference_mode():
-        mean, cov = model(image)
-    got_sigma, sigma = (np.sqrt(np.diagonal(c, axis1=1, axis2=2)) for c in (got_cov, cov.numpy()))
-    return float(max(np.abs(got_mean - mean.numpy()).max(), np.abs(got_sigma - sigma).max()) / size)
+        answers = [network(torch.from_numpy(batch)) for batch in _batches(pictures)]
+    return [torch.cat(parts).double().numpy() for parts in zip(*answers, strict=True)]
 
 
-def _folder_of(path: Path) -> Path:
+def compare(model: ModelProto, pictures: Pictures, wanted: list[Array]) -> Difference:
+    """How far ONNX Runtime's answers are from those `wanted` (`answers_of`)."""
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    answers = [session.run(OUTPUTS, {"image": batch}) for batch in _batches(pictures)]
+    mean, cov, *scope = (np.concatenate(parts).astype(np.float64) for parts in zip(*answers, strict=True))
+    true_mean, true_cov, *true_scope = wanted
+    sigma, correlation = _split(cov)
+    true_sigma, true_correlation = _split(true_cov)
+    return Difference(
+        _rms(mean - true_mean),
+        max(_rms(sigma / true_sigma - 1), _rms(correlation - true_correlation)),
+        max(_rms(mine - true) for mine, true in zip(scope, true_scope, strict=True)),
+    )
+
+
+def _split(cov: Array) -> tuple[Array, Array]:
+    """Sigmas (N, n) and correlations (N, n, n)."""
+    sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    return sigma, cov / (sigma[:, :, None] * sigma[:, None, :])
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _batches(pictures: Pictures) -> Iterator[Pictures]:
+    return (pictures[start : start + _BATCH] for start in range(0, len(pictures), _BATCH))
+
+
+def _backbone(model: ModelProto) -> list[NodeProto]:
+    """The nodes that the backbone's feature maps come from, in order."""
+    nodes: list[NodeProto] = []
+    needed: set[str] = set()
+    for node in reversed(model.graph.node):
+        scopes = next((note.value for note in node.metadata_props if note.key == "pkg.torch.onnx.name_scopes"), "")
+        if "'net.backbone'" in scopes or needed & set(node.output):
+            nodes.insert(0, node)
+            needed |= set(node.input)
+    return nodes
+
+
+def _halved(model: ModelProto) -> ModelProto:
+    """With the backbone in fp16.
+
+    Cut off and put back: given nodes to spare, ONNX Runtime's converter still rounds what lies between them.
+    """
+    from onnx import compose
+    from onnx.utils import Extractor
+    from onnxruntime.transformers.float16 import convert_float_to_float16
+
+    body = {output for node in _backbone(model) for output in node.output}
+    rest = [node for node in model.graph.node if not body & set(node.output)]
+    maps = list(dict.fromkeys(name for node in rest for name in node.input if name in body))
+    parts = Extractor(model)
+    low = convert_float_to_float16(parts.extract_model(["image"], maps), keep_io_types=True)
+    in_order = onnx_ir.from_proto(low)
+    in_order.graph.sort()
+    low = compose.add_prefix(onnx_ir.to_proto(in_order), "backbone.", rename_inputs=False)
+    high = parts.extract_model(maps, list(OUTPUTS))
+    return compose.merge_models(low, high, io_map=[(f"backbone.{name}", name) for name in maps])
+
+
+def _quantised(
+    model: ModelProto, network: Network, ranges: Pictures, held_out: Pictures
+) -> tuple[ModelProto, Difference, float]:
+    """With as much of the backbone in int8 as the limits allow, and which share of its layers; or the last try.
+
+    Its first layers stay in float32: they cost most (what they round away, no later layer sees) and weigh least.
+    """
+    backbone = _backbone(model)
+    layers = [n for n, node in enumerate(backbone) if node.op_type in ("Conv", "Gemm", "MatMul")]
+    wanted = answers_of(network, held_out)
+    for spared in range(0, len(layers), -(-len(layers) // _TRIES)):
+        quantised = _with_int8(model, {node.name for node in backbone[layers[spared] :]}, ranges)
+        difference = compare(quantised, held_out, wanted)
+        if difference.within(LIMITS["int8"]):
+            break
+    return quantised, difference, 1 - spared / len(layers)
+
+
+def _with_int8(model: ModelProto, names: set[str], ranges: Pictures) -> ModelProto:
+    """With the nodes of these names in int8, quantised and dequantised around each; one scale a channel."""
+    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, quantize_static
+    from onnxruntime.quantization.quant_utils import add_pre_process_metadata
+
+    class Reader(CalibrationDataReader):  # type: ignore[misc]
+        def __init__(self) -> None:
+            self.batches = _batches(ranges)
+
+        def get_next(self) -> dict[str, Pictures] | None:
+            batch = next(self.batches, None)
+            return None if batch is None else {"image": batch}
+
+    spared = [node.name for node in model.graph.node if node.name not in names]
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "int8.onnx"
+        copy = ModelProto()
+        copy.CopyFrom(model)
+        add_pre_process_metadata(copy)  # torch's exporter has folded what pre-processing would; else it warns
+        quantize_static(
+            copy, path, Reader(), quant_format=QuantFormat.QDQ, per_channel=True, nodes_to_exclude=spared,
+            op_types_to_quantize=list(_QUANTISED),
+        )  # fmt: skip
+        return onnx.load(path)
+
+
+def _writable(path: Path) -> Path:
     if not path.parent.is_dir():
         raise InputError(f"{path}: no such folder {path.parent}; make it first")
     if path.is_dir():
         raise InputError(f"{path}: cannot be written: Is a directory")
-    return path.parent
+    return path

@@ -1,116 +1,224 @@
-"""`shortfinal train`: fit a KeypointNet to a rendered data set, resumable after a stop or a kill."""
+"""`shortfinal train`: fit a KeypointNet to labelled pictures, on one process or many; goes on after a stop."""
 
 from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from lightning.fabric import Fabric
+from lightning.fabric.loggers.tensorboard import TensorBoardLogger
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, Dataset
 
 from shortfinal.calibration import coverage
-from shortfinal.crops import box_around, centre_crop
-from shortfinal.data.augment import augmented_crop
-from shortfinal.data.dataset import read_dataset
+from shortfinal.crops import box_around, centre_crop, native_crop
+from shortfinal.data.augment import augmented_crop, inside, within
+from shortfinal.data.dataset import Example, LabelledDataset, read_dataset
+from shortfinal.data.formats import split_by_airport
 from shortfinal.detector import crop_image, normalise
 from shortfinal.errors import InputError, JobError
 from shortfinal.files import csv_text, make_folder, write_whole
-from shortfinal.train.model import KeypointNet, gaussian_nll, to_pixels, variance_px
+from shortfinal.geometry import PixelWindow
+from shortfinal.train.loss import attention_loss, gaussian_nll, scope_loss
+from shortfinal.train.model import KeypointNet, Prediction
+from shortfinal.train.recipe import Recipe, to_dict
+from shortfinal.train.weights import FOLDED_MEAN, FOLDED_STD, first_line, load_weights
 
-Batch = tuple[Tensor, Tensor]
+LEVELS = (0.5, 0.68, 0.9, 0.95, 0.99)  # at which coverage is reported
+_RISE = 0.03  # share of the steps in which the learning rate rises
 
-MEAN, STD = (0.45, 0.45, 0.45), (0.22, 0.22, 0.22)
 
+class Batch(NamedTuple):
+    """Crops, where their corners are, and how much they were enlarged."""
 
-@dataclass(frozen=True)
-class Recipe:
-    """How to train. Everything that the result depends on, besides the data."""
+    image: Tensor  # (B, 3, S, S)
+    corners_px: Tensor  # (B, K, 2); anything where not visible
+    visible: Tensor  # (B, K) 0 or 1: labelled, and in the picture and the crop
+    scale: Tensor  # (B,) pixels of the crop per pixel of the picture
 
-    data: str  # folder of the training scenes
-    validation: str  # folder of the held-out scenes
-    out: str  # folder of the checkpoints
-    backbone: str = "mobilenetv3_small_100"  # any timm model with features_only
-    width: int = 96  # channels of the head
-    size: int = 224  # side of the crop, px
-    margin: float = 1.4  # of the evaluation crop; training draws its own (crops.random_margin)
-    batch: int = 32
-    steps: int = 10000
-    warm_up: float = 0.1  # share of the steps before the variance enters the mean's loss
-    learning_rate: float = 2e-3
-    weight_decay: float = 0.02
-    ema: float = 0.998
-    validate_every: int = 500  # steps
-    validation_count: int = 1000
-    workers: int = 1
-    seed: int = 0
+    def to(self, device: Any) -> Batch:
+        """On another device, pictures with their channels last."""
+        return Batch(
+            self.image.to(device).contiguous(memory_format=torch.channels_last), *(part.to(device) for part in self[1:])
+        )
 
 
 class _Draws(Dataset[Batch]):
-    """Draw number n of the training run: a function of the seed and n, so that resuming is exact."""
+    """The crops that one process trains on: number n of the run is a function of the seed and n, so that
+    resuming is exact, and as many processes as there may be draw the same together.
+    """
 
-    def __init__(self, recipe: Recipe, start: int) -> None:
-        self.examples = read_dataset(recipe.data)
-        self.recipe, self.start = recipe, start
+    def __init__(self, examples: LabelledDataset, recipe: Recipe, steps: range, rank: int, share: int) -> None:
+        self.examples, self.recipe, self.steps, self.rank, self.share = examples, recipe, steps, rank, share
+        self._turn, self._order = -1, np.empty(0, int)
 
     def __len__(self) -> int:
-        return (self.recipe.steps * self.recipe.batch) - self.start
+        return len(self.steps) * self.share
 
     def __getitem__(self, index: int) -> Batch:
-        rng = np.random.default_rng([self.recipe.seed, 1, self.start + index])
-        example = self.examples[int(rng.integers(len(self.examples)))]
-        crop, corners = augmented_crop(example, self.recipe.size, rng)
-        image = normalise(crop, MEAN, STD)
-        return torch.from_numpy(image), torch.from_numpy(corners.astype(np.float32))
+        step, place = divmod(index, self.share)
+        recipe = self.recipe
+        number = self.steps[step] * recipe.batch + self.rank * self.share + place
+        rng = np.random.default_rng([recipe.seed, 1, number])
+        example = self.examples[self._pick(number)]
+        native = recipe.crop == "native"
+        crop, corners = augmented_crop(example, recipe.size, rng, native=native, weather=recipe.weather)
+        return _labelled(crop, corners, 1.0, recipe)
+
+    def _pick(self, number: int) -> int:
+        """Which example: each once in every pass over the data, in that pass's own order."""
+        turn, place = divmod(number, len(self.examples))
+        if turn != self._turn:
+            rng = np.random.default_rng([self.recipe.seed, 3, turn])
+            self._turn, self._order = turn, rng.permutation(len(self.examples))
+        return int(self._order[place])
 
 
 class _Held(Dataset[Batch]):
-    """The held-out scenes, cropped at the centre."""
+    """The held-out pictures, or so many of them from beginning to end: framed at the centre, or the paper's crop."""
 
-    def __init__(self, recipe: Recipe) -> None:
-        self.examples = read_dataset(recipe.validation)
-        self.recipe = recipe
+    def __init__(self, examples: LabelledDataset, recipe: Recipe) -> None:
+        self.examples, self.recipe = examples, recipe
 
     def __len__(self) -> int:
         return min(len(self.examples), self.recipe.validation_count)
 
     def __getitem__(self, index: int) -> Batch:
-        example = self.examples[index]
-        window = centre_crop(box_around(example.corners_px), self.recipe.margin, self.recipe.size)
-        image = normalise(crop_image(example.image, window), MEAN, STD)
-        return torch.from_numpy(image), torch.from_numpy(window.apply(example.corners_px).astype(np.float32))
+        number = index * len(self.examples) // len(self)
+        example = self.examples[number]
+        window = held_out_window(example, self.recipe, number)
+        corners = window.apply(within(example))
+        return _labelled(crop_image(example.image, window), corners, window.scale[0], self.recipe)
 
 
-def validate(model: torch.nn.Module, batches: Iterable[Batch], size: int) -> dict[str, float]:
-    """Errors in pixels of the crop, per coordinate, and how honest the predicted sigma is."""
-    model.eval()
-    errors, variances = [], []
-    with torch.inference_mode():
-        for image, corners in batches:
-            mean, log_variance = model(image.contiguous(memory_format=torch.channels_last))
-            errors.append(to_pixels(mean, size) - corners)
-            variances.append(variance_px(log_variance))
-    error, sigma = torch.cat(errors), torch.cat(variances).sqrt()
-    size_of = error.abs()
-    covered = coverage(error.cpu().numpy(), sigma.cpu().numpy(), (0.68, 0.95))
-    return {
-        "nll": float((0.5 * (error / sigma).square() + sigma.log()).mean()),
-        "median_px": float(size_of.median()),
-        "p90_px": float(size_of.flatten().quantile(0.9)),
-        "mean_px": float(size_of.mean()),
-        "far_median_px": float(size_of[:, 2:].median()),
-        "coverage_68": float(covered[0]),
-        "coverage_95": float(covered[1]),
+def held_out_window(example: Example, recipe: Recipe, index: int) -> PixelWindow:
+    """Where a held-out picture is looked at: around the corners in it; the whole of one without a runway."""
+    height, width = example.image.shape[:2]
+    corners = within(example)[:4]
+    seen = corners[np.isfinite(corners).all(axis=1)]
+    if len(seen) < 2:
+        return PixelWindow.resize(width, height, recipe.size, recipe.size)
+    if recipe.crop == "native" and len(seen) == 4:
+        rng = np.random.default_rng([recipe.seed, 2, index])
+        return native_crop(box_around(seen), (width, height), rng, recipe.size, 0.0)
+    return centre_crop(box_around(seen), recipe.margin, recipe.size)
+
+
+def _labelled(crop: np.ndarray[Any, Any], corners: np.ndarray[Any, Any], scale: float, recipe: Recipe) -> Batch:
+    mean, std = (tuple(float(v) for v in values) for values in (recipe.mean, recipe.std))
+    visible = inside(corners, recipe.size, recipe.size)  # NaN is not
+    places = np.where(visible[:, None], corners, 0.0).astype(np.float32)
+    return Batch(
+        torch.from_numpy(normalise(crop, mean, std)), torch.from_numpy(places),
+        torch.from_numpy(visible.astype(np.float32)), torch.tensor(scale, dtype=torch.float32),
+    )  # fmt: skip
+
+
+def open_data(recipe: Recipe) -> tuple[LabelledDataset, LabelledDataset]:
+    """Training and held-out examples.
+
+    Without folders of held-out ones: what the data set calls train and val, or, of all that it does not
+    call test, a fifth of the airports. Raises InputError if one of the two shows no runway, or if they
+    share an airport and the recipe does not allow it.
+    """
+    train = _together(recipe.data, recipe.keypoints)
+    train, held = (
+        (train, _together(recipe.validation, recipe.keypoints)) if recipe.validation else _split(train, recipe)
+    )
+    sources = {"training": recipe.data, "held-out": recipe.validation or recipe.data}
+    for (name, folders), part in zip(sources.items(), (train, held), strict=True):
+        if not any(label is not None for _, label in part.labels):
+            raise InputError(f"{' '.join(folders)}: no {name} picture shows a runway")
+    shared = sorted(_airports(train) & _airports(held))
+    if shared and not recipe.share_airports:
+        raise InputError(
+            f"{len(shared)} airports are in both training and validation (first: {shared[0]}); split by airport "
+            "(`shortfinal data convert --split`), or set share_airports = true"
+        )
+    return train, held
+
+
+def _split(data: LabelledDataset, recipe: Recipe) -> tuple[LabelledDataset, LabelledDataset]:
+    labels = data.labels
+    splits = [picture.split for picture, _ in labels]
+    if not {"train", "val"} <= set(splits):
+        labels = [label for label, split in zip(labels, splits, strict=True) if split != "test"]
+        try:
+            splits = split_by_airport([picture for picture, _ in labels], (0.8, 0.2), recipe.seed)
+        except InputError as error:
+            raise InputError(f"{' '.join(recipe.data)}: {error}; or name pictures for validation") from error
+    parts = [[label for label, split in zip(labels, splits, strict=True) if split == name] for name in ("train", "val")]
+    return LabelledDataset(parts[0], data.keypoints), LabelledDataset(parts[1], data.keypoints)
+
+
+def _together(folders: Iterable[str], keypoints: tuple[str, ...]) -> LabelledDataset:
+    return LabelledDataset([label for folder in folders for label in read_dataset(folder, keypoints).labels], keypoints)
+
+
+def _airports(data: LabelledDataset) -> set[str]:
+    return {label.airport for picture, _ in data.labels for label in picture.labels if label.airport}
+
+
+def figures_of(prediction: Prediction, batch: Batch) -> dict[str, float]:
+    """What a network makes of held-out crops: errors in pixels of the crop, per coordinate of visible corners,
+    how honest sigma is, and how well crops with and without a runway are told apart.
+
+    `nll` is the negative log-likelihood of the predicted Gaussians per coordinate, without its constant;
+    `native_mean_px` is in pixels of the picture that the crop was enlarged from. Raises InputError if
+    no corner is visible.
+    """
+    seen = batch.visible.bool()
+    if not seen.any():
+        raise InputError("validation: no corner of a runway can be seen in the held-out crops")
+    nll = gaussian_nll(prediction.mean_px - batch.corners_px, prediction.sigma_px, prediction.factor, batch.visible)
+    error = (prediction.mean_px - batch.corners_px)[seen]
+    sigma, size = prediction.sigma_px[seen], error.abs()
+    native = size / batch.scale[:, None, None].expand_as(batch.corners_px)[seen]
+    far = (prediction.mean_px - batch.corners_px).abs()[:, 2:4][seen[:, 2:4]]
+    covered = coverage(error.cpu().numpy(), sigma.cpu().numpy(), LEVELS)
+    figures = {
+        "nll": float(nll.sum() / error.numel()),
+        "mean_px": float(size.mean()),
+        "median_px": float(size.median()),
+        "p90_px": float(size.flatten().quantile(0.9)),
+        "native_mean_px": float(native.mean()),
+        "far_median_px": float(far.median()) if len(far) else math.nan,
+        **{f"coverage_{round(100 * level)}": float(share) for level, share in zip(LEVELS, covered, strict=True)},
     }
+    present = seen.any(dim=1).cpu().numpy()
+    if present.any() and not present.all():
+        figures["present_auroc"] = auroc(prediction.present.cpu().numpy(), present)
+    return figures
+
+
+def auroc(scores: np.ndarray[Any, Any], positive: np.ndarray[Any, Any]) -> float:
+    """Chance that a positive scores above a negative, ties counted half (Mann and Whitney)."""
+    from scipy.stats import rankdata
+
+    n = int(positive.sum())
+    return float((rankdata(scores)[positive].sum() - n * (n + 1) / 2) / (n * (len(scores) - n)))
+
+
+def predict(model: Callable[[Tensor], Prediction], batches: Iterable[Batch]) -> tuple[Prediction, Batch]:
+    """The network's answer to all batches, and the batches (less their pictures), each as one."""
+    answers, asked = [], []
+    with torch.inference_mode():
+        for batch in batches:
+            answer = model(batch.image.contiguous(memory_format=torch.channels_last))
+            answers.append(answer._replace(attention=None))
+            asked.append(batch._replace(image=batch.image[:, :, :0, :0]))
+    parts: list[Any] = [None if c[0] is None else torch.cat(list(c)) for c in zip(*answers, strict=True)]
+    return Prediction(*parts), Batch(*(torch.cat(list(column)) for column in zip(*asked, strict=True)))
 
 
 class Run:
@@ -118,24 +226,35 @@ class Run:
 
     _PARTS = ("net", "average", "optimizer", "schedule")
 
-    def __init__(self, recipe: Recipe) -> None:
+    def __init__(self, recipe: Recipe, length: int) -> None:
         self.recipe, self.folder = recipe, Path(recipe.out)
-        self.fabric = Fabric(accelerator="auto", devices=1)
+        self.steps = max(1, round(recipe.epochs * length / recipe.batch)) if recipe.epochs else recipe.steps
+        world, here = (int(os.environ.get(name, 1)) for name in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))  # torchrun's
+        if recipe.batch % world:
+            raise InputError(f"batch: {recipe.batch} pictures cannot be shared evenly by {world} processes")
+        self.fabric = Fabric(
+            accelerator="auto", devices=here, num_nodes=world // here, strategy="ddp" if world > 1 else "auto",
+            precision=recipe.precision, loggers=TensorBoardLogger(self.folder, name="tensorboard", version=""),
+        )  # fmt: skip
+        self.fabric.launch()
         torch.manual_seed(recipe.seed)
-        self.net = KeypointNet(recipe.backbone, width=recipe.width)
+        fresh = not (recipe.start or (self.folder / "last.pt").exists())
+        self.net = _network(recipe, pretrained=fresh and recipe.weights == "timm")
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        optimizer = torch.optim.AdamW(self.net.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
-        self.schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, recipe.learning_rate, total_steps=recipe.steps + 1, pct_start=0.08
-        )
+        if recipe.learn == "covariance":
+            for part in self.net.means:
+                part.requires_grad_(False)
+        optimizer = _optimizer(recipe, self.net)
+        self.schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(recipe, step / self.steps))
         self.model, self.optimizer = self.fabric.setup(self.net, optimizer)
-        self.average = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema), use_buffers=True)
+        self.average = AveragedModel(self.net, multi_avg_fn=_averaging(recipe.ema), use_buffers=True)
         self.step, self.history = 0, list[dict[str, float]]()
 
     def save(self, name: str) -> None:
         """Write a checkpoint whole or not at all."""
         parts = {part: getattr(self, part).state_dict() for part in self._PARTS}
-        state = parts | {"step": self.step, "history": self.history, "recipe": asdict(self.recipe)}
+        state = parts | {"step": self.step, "history": self.history, "recipe": to_dict(self.recipe)}
+        state["precision"] = self.fabric.strategy.precision.state_dict()  # of half precision: the loss's scale
         content = io.BytesIO()
         torch.save(state, content)
         write_whole(self.folder / name, content.getvalue())
@@ -146,31 +265,68 @@ class Run:
         if not path.exists():
             return False
         state = load_checkpoint(path)
-        was, now = state["recipe"], asdict(self.recipe)
+        was, now = state["recipe"], to_dict(self.recipe)
         changed = [k for k in now if was.get(k) != now[k] and k not in ("out", "workers")]
         if changed:
             raise InputError(f"{path}: was made with another {', '.join(changed)}; choose another --out")
         for part in self._PARTS:
             getattr(self, part).load_state_dict(state[part])
+        self.fabric.strategy.precision.load_state_dict(state.get("precision", {}))
         self.step, self.history = state["step"], state["history"]
         return True
 
-    def advance(self, image: Tensor, corners: Tensor) -> float:
-        """One step of the optimiser; returns the loss."""
+    def begin(self, pictures: Callable[[], Tensor]) -> None:
+        """Start anew: from another run's averaged network, or pretrained weights, settled on `pictures` of the data."""
+        recipe = self.recipe
+        if recipe.start:
+            state = load_checkpoint(recipe.start)
+            weights, mine = network_weights(state), self.net.state_dict()
+            was, now = state["recipe"], to_dict(recipe)
+            differ = [name for name in ("backbone", "head", "features", "mean", "std") if was[name] != now[name]]
+            differ += [k for k, v in weights.items() if k not in mine or mine[k].shape != v.shape]
+            # One that had no correlations may become one that has.
+            differ += [k for k in mine if k not in weights and not k.startswith("correlation.")]
+            if differ:
+                raise InputError(f"{recipe.start}: of another network ({differ[0]} differs)")
+            self.net.load_state_dict(weights, strict=False)
+        elif recipe.weights not in ("", "timm"):
+            if recipe.weights.endswith(".npz") and (recipe.mean, recipe.std) != (FOLDED_MEAN, FOLDED_STD):
+                raise InputError(f"{recipe.weights}: needs mean = {list(FOLDED_MEAN)} and std = {list(FOLDED_STD)}")
+            load_weights(self.net.backbone, recipe.weights, pictures().to(self.fabric.device))
+        self.average.module.load_state_dict(self.net.state_dict())
+
+    def loss(self, batch: Batch) -> Tensor:
+        """What this step minimises: a mean over the batch's pictures, so that processes can share it."""
+        recipe = self.recipe
+        prediction = self.model(batch.image)
+        error = (prediction.mean_px - batch.corners_px) * batch.visible[..., None]
+        coordinates = error[0].numel()
+        warming = self.step < recipe.warm_up * self.steps
+        # Means first: while they are far off, the variance would only learn to excuse them.
+        shown = error.detach() if warming else error
+        nll = gaussian_nll(shown, prediction.sigma_px, prediction.factor, batch.visible, recipe.likelihood)
+        loss: Tensor = nll.mean() / coordinates
+        if warming:
+            loss = loss + 0.1 * error.abs().mean()
+        if prediction.attention is not None and recipe.attention_weight:
+            told = attention_loss(prediction.attention, batch.corners_px, batch.visible, recipe.size).mean()
+            loss = loss + recipe.attention_weight * told / len(recipe.keypoints)
+        return loss + recipe.scope_weight * scope_loss(prediction, batch.visible).mean()
+
+    def advance(self, batch: Batch) -> float:
+        """One step of the optimiser; returns the loss over all processes."""
         self.model.train()
-        mean, log_variance = self.model(image.contiguous(memory_format=torch.channels_last))
-        error = to_pixels(mean, self.recipe.size) - corners
-        if self.step < self.recipe.warm_up * self.recipe.steps:
-            # Means first: while they are far off, the variance would only learn to excuse them.
-            loss = 0.1 * error.abs().mean() + gaussian_nll(error.detach(), log_variance)
-        else:
-            loss = gaussian_nll(error, log_variance)
-        value = float(loss.detach())
+        if self.recipe.learn == "covariance":
+            for part in self.net.means:
+                part.eval()
+        loss = self.loss(batch.to(self.fabric.device))
+        value = float(self.fabric.all_reduce(loss.detach(), reduce_op="mean"))  # type: ignore[arg-type]
         if not math.isfinite(value):
-            raise JobError(f"diverged at step {self.step + 1}; lower --learning-rate")
+            raise JobError(f"diverged at step {self.step + 1}; lower the learning rate")
         self.optimizer.zero_grad(set_to_none=True)
         self.fabric.backward(loss)
-        self.fabric.clip_gradients(self.model, self.optimizer, max_norm=5.0)
+        # What is not finite here shows in the next loss; half precision meets it now and then, and skips the step.
+        self.fabric.clip_gradients(self.model, self.optimizer, max_norm=5.0, error_if_nonfinite=False)
         self.optimizer.step()
         self.schedule.step()
         self.average.update_parameters(self.net)
@@ -181,10 +337,62 @@ class Run:
         """Keep a validation: last.pt always, best.pt if it is the best yet, and the table of all."""
         best = min((row["nll"] for row in self.history), default=math.inf)
         self.history.append(figures)
+        self.fabric.log_dict(figures, step=self.step)
+        self.fabric.logger.experiment.flush()
         if figures["nll"] < best:
             self.save("best.pt")
         write_whole(self.folder / "log.csv", csv_text(figures, self.history))
         self.save("last.pt")  # last of all: what is lost by a kill before it is done again, not twice
+
+
+def _network(recipe: Recipe, pretrained: bool) -> KeypointNet:
+    """The recipe's network, once tried. Raises InputError for a backbone that has no weights, or not this size."""
+    try:
+        net = KeypointNet(
+            recipe.backbone, len(recipe.keypoints), recipe.head, recipe.covariance, recipe.features, recipe.width,
+            pretrained=pretrained,
+        )  # fmt: skip
+        with torch.no_grad():
+            net.eval()(torch.zeros(1, 3, recipe.size, recipe.size))
+    except InputError:
+        raise
+    except Exception as error:  # timm's and torch's, of many kinds
+        what = "weights = timm" if pretrained else f"size {recipe.size}"
+        raise InputError(f"backbone: {recipe.backbone!r} with {what}: {first_line(error)}") from error
+    return net
+
+
+def _optimizer(recipe: Recipe, net: torch.nn.Module) -> torch.optim.Optimizer:
+    kinds: dict[str, Any] = {"adamw": torch.optim.AdamW, "adam": torch.optim.Adam, "rmsprop": torch.optim.RMSprop}
+    learning = [weight for weight in net.parameters() if weight.requires_grad]
+    made: torch.optim.Optimizer = kinds[recipe.optimizer](
+        learning, lr=recipe.learning_rate, weight_decay=recipe.weight_decay
+    )
+    return made
+
+
+def _rate(recipe: Recipe, done: float) -> float:
+    """The learning rate, as a share of the recipe's, when that share of the steps is done."""
+    if recipe.schedule == "constant":
+        return 1.0
+    if done < _RISE:
+        return max(done / _RISE, 1e-2)
+    return 0.5 * (1 + math.cos(math.pi * min(1.0, (done - _RISE) / (1 - _RISE))))
+
+
+def _averaging(decay: float) -> Callable[[Any, Any, Any], None]:
+    """An exponential moving average that forgets its first, untrained weights."""
+
+    def update(averaged: list[Tensor], current: list[Tensor], count: Tensor) -> None:
+        keep = min(decay, (1.0 + float(count)) / (10.0 + float(count)))
+        for mine, new in zip(averaged, current, strict=True):
+            if mine.is_floating_point():
+                mine.lerp_(new.to(mine), 1.0 - keep)
+            else:
+                mine.copy_(new)
+
+    quiet: Callable[[Any, Any, Any], None] = torch.no_grad()(update)
+    return quiet
 
 
 def load_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -192,9 +400,9 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
-        raise InputError(f"{path}: cannot read the checkpoint: {error.strerror}") from error
+        raise InputError(f"{path}: cannot read the checkpoint: {error.strerror or error}") from error
     except Exception as error:  # torch raises many kinds for a file that is not a checkpoint
-        raise InputError(f"{path}: not a checkpoint: {str(error).splitlines()[0][:120]}") from error
+        raise InputError(f"{path}: not a checkpoint: {first_line(error)}") from error
     if not isinstance(state, dict) or "recipe" not in state:
         raise InputError(f"{path}: a torch file, but not a checkpoint of shortfinal train")
     recipe = state["recipe"] if isinstance(state["recipe"], dict) else {}
@@ -205,33 +413,63 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     return state
 
 
+def network_weights(state: dict[str, Any]) -> dict[str, Tensor]:
+    """The averaged network of a checkpoint's content: its state is under "module.", beside a count."""
+    return {k.removeprefix("module."): v for k, v in state["average"].items() if k.startswith("module.")}
+
+
 def train(recipe: Recipe, console: Console | None = None) -> dict[str, float]:
     """Train, or go on from the last validation; returns the figures of the best (out/best.pt).
 
-    Keeps out/last.pt for resuming and out/log.csv, a row at each validation.
+    Keeps out/last.pt for resuming, out/log.csv, a row at each validation, and out/tensorboard. Started
+    by `torchrun`, the processes share each batch. Raises InputError for data or a recipe of no use,
+    JobError if the loss diverges.
     """
-    console = console or Console()
+    learning, held_out = open_data(recipe)
     make_folder(recipe.out)
-    run = Run(recipe)
+    run = Run(recipe, len(learning))
+    first = run.fabric.is_global_zero
+    shown = (console or Console()) if first else Console(quiet=True)
     if run.resume():
-        console.print(f"going on from step {run.step}")
-    held: Any = run.fabric.setup_dataloaders(DataLoader(_Held(recipe), batch_size=64))
-    draws = _Draws(recipe, run.step * recipe.batch)
-    batches: Any = run.fabric.setup_dataloaders(DataLoader(draws, batch_size=recipe.batch, num_workers=recipe.workers))
-    smooth = math.nan
+        shown.print(f"going on from step {run.step}")
+    else:
+        run.begin(lambda: _some(learning, recipe))
+    share = recipe.batch // run.fabric.world_size
+    draws = _Draws(learning, recipe, range(run.step, run.steps), run.fabric.global_rank, share)
+    batches: Iterable[Batch] = DataLoader(draws, batch_size=share, num_workers=recipe.workers)
+    smooth = run.history[-1]["loss"] if run.history else math.nan
     try:
-        with _bar(console) as bar:
-            task = bar.add_task("training", total=recipe.steps, completed=run.step, note="")
-            for image, corners in batches:
-                loss = run.advance(image, corners)
+        with _bar(shown) as bar:
+            task = bar.add_task("training", total=run.steps, completed=run.step, note="")
+            for batch in batches:
+                loss = run.advance(batch)
                 smooth = loss if math.isnan(smooth) else 0.98 * smooth + 0.02 * loss
                 bar.update(task, completed=run.step, note=f"loss {smooth:.3f}" + _brief(run.history))
-                if run.step % recipe.validate_every == 0 or run.step == recipe.steps:
-                    run.record({"step": run.step, "loss": smooth, **validate(run.average, held, recipe.size)})
+                if run.step % recipe.validate_every == 0 or run.step == run.steps:
+                    if first:
+                        run.record({"step": run.step, "loss": smooth, **_validate(run, held_out)})
+                    run.fabric.barrier()
     except InputError as error:  # a worker's comes with its traceback before it
         line = str(error).strip().splitlines()[-1]
         raise InputError(line.removeprefix("shortfinal.errors.InputError: ")) from error
-    return min(run.history, key=lambda row: row["nll"])
+    history = run.fabric.broadcast(run.history)
+    return min(history, key=lambda row: row["nll"])
+
+
+def _some(examples: LabelledDataset, recipe: Recipe) -> Tensor:
+    """The first pictures of the run (N, 3, S, S): up to 64, and no more than four batches."""
+    count = min(64, recipe.batch * 4)
+    draws = _Draws(examples, recipe, range(1), 0, count)
+    return torch.stack([draws[n].image for n in range(count)])
+
+
+def _validate(run: Run, examples: LabelledDataset) -> dict[str, float]:
+    run.average.eval()
+    loader = DataLoader(_Held(examples, run.recipe), batch_size=50)
+    prediction, batch = predict(run.average, (batch.to(run.fabric.device) for batch in loader))
+    if not (prediction.mean_px.isfinite().all() and prediction.sigma_px.isfinite().all()):
+        raise JobError(f"diverged at step {run.step}; lower the learning rate")
+    return figures_of(prediction, batch)
 
 
 def _bar(console: Console) -> Progress:

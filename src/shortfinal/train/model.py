@@ -1,12 +1,12 @@
-"""The network: backbone, one 1x1 convolution, spatial soft argmax; and its Gaussian likelihood.
+"""The network: backbone, keypoint head, predicted covariance; after Valentin et al. 2025 (arXiv 2508.09732).
 
-Valentin et al. 2025 (arXiv 2508.09732). Where this departs from it: docs/paper.md.
+Where this departs from the paper: docs/paper.md. What was tried: docs/log.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -15,68 +15,147 @@ from torch.nn import functional
 from shortfinal.errors import InputError
 from shortfinal.train import timm
 
+Head = Literal["sam", "fc"]
+Covariance = Literal["diagonal", "keypoint", "full"]
+
 MIN_SIGMA_PX = 0.03  # keeps the likelihood finite on a picture seen too often
+_FIRST_LOG_VARIANCE = 6.0  # a sigma of 20 px: an untrained network knows nothing
+_HIDDEN = 64  # of the layers that turn pooled features into sigmas, correlations and logits
+
+
+class Prediction(NamedTuple):
+    """What the network says of B pictures and K keypoints, in pixels of its input."""
+
+    mean_px: Tensor  # (B, K, 2)
+    sigma_px: Tensor  # (B, K, 2)
+    factor: Tensor | None  # (B, 2K, 2K) lower, of the correlation; None: the identity
+    visible: Tensor  # (B, K) logits: this keypoint is in the picture
+    present: Tensor  # (B,) logits: a runway is in the picture
+    attention: Tensor | None  # (B, K, H, W) logarithm of where each keypoint is looked for; None: the head has none
+
+    @property
+    def cov_px(self) -> Tensor:
+        """Covariances (B, 2K, 2K)."""
+        sigma = self.sigma_px.flatten(1)
+        if self.factor is None:
+            return torch.diag_embed(sigma.square())
+        root = sigma[:, :, None] * self.factor
+        return root @ root.transpose(1, 2)
 
 
 class KeypointNet(nn.Module):
-    """Images (B, 3, S, S) to means (B, K, 2) in [0, 1] and log-variances (B, K, 2) in px² of the input.
+    """Pictures (B, 3, S, S) to a `Prediction`.
 
-    Features of several strides are brought to the finest by bilinear interpolation and summed, so
-    that the deep ones say which corner and the shallow ones say where.
+    `backbone`: any timm model with `features_only`, convolutional or transformer. `head`: "sam", the
+    paper's 1x1 convolution and spatial soft argmax, or "fc", its baseline: pool, hidden layer,
+    coordinates. `features`: strides of the feature maps; one, (32,) as published, is used as it is,
+    several are fused from deep to shallow with `width` channels, so that the deep ones say which
+    corner and the shallow ones say where. `covariance`: sigmas only, or also how the two coordinates
+    of a keypoint correlate, or how all 2K do (by the Cholesky factor of the correlation matrix).
+
+    Raises InputError for a backbone timm does not have, or without such feature maps.
     """
 
     def __init__(
         self,
-        backbone: str = "mobilenetv3_small_100",
+        backbone: str = "mobilenetv4_conv_small",
         keypoints: int = 4,
-        width: int = 96,
-        strides: Sequence[int] = (8, 16, 32),
+        head: Head = "sam",
+        covariance: Covariance = "diagonal",
+        features: Sequence[int] = (4, 8, 16, 32),
+        width: int = 48,
         pretrained: bool = False,
     ) -> None:
         super().__init__()
-        try:
-            probe: Any = timm.create_model(backbone, features_only=True, pretrained=False)
-        except (RuntimeError, AttributeError) as error:  # timm's: no such model, or one without feature maps
-            raise InputError(f"backbone: {backbone!r}: {str(error).strip().splitlines()[0]}") from error
-        every: list[int] = probe.feature_info.reduction()
-        if not set(strides) <= set(every):
-            raise InputError(
-                f"backbone: {backbone!r} has the strides {', '.join(map(str, sorted(set(every))))}; "
-                f"{', '.join(map(str, strides))} are needed"
-            )
-        taken = [len(every) - 1 - every[::-1].index(stride) for stride in strides]
-        features: Any = timm.create_model(backbone, features_only=True, pretrained=pretrained, out_indices=taken)
-        self.backbone = features
-        channels: list[int] = features.feature_info.channels()
-        self.lateral = nn.ModuleList([nn.Conv2d(c, width, 1, bias=False) for c in channels])
-        self.fuse = nn.Sequential(
-            nn.BatchNorm2d(width), nn.Hardswish(),
-            nn.Conv2d(width, width, 3, padding=1, groups=width, bias=False), nn.BatchNorm2d(width), nn.Hardswish(),
-            nn.Conv2d(width, width, 1, bias=False), nn.BatchNorm2d(width), nn.Hardswish(),
-        )  # fmt: skip
-        self.score = nn.Conv2d(width, keypoints, 1)
-        self.log_variance = nn.ModuleList([nn.Linear(2 * width + 2, 2) for _ in range(keypoints)])
+        for name, value, known in (("head", head, Head), ("covariance", covariance, Covariance)):
+            if value not in get_args(known):
+                raise InputError(f"{name}: {value!r}; expected one of {', '.join(get_args(known))}")
+        self.keypoints, self.head, self.covariance = keypoints, head, covariance
+        self.backbone, channels = _backbone(backbone, features, pretrained)
+        self.neck = Neck(channels, width) if len(channels) > 1 else nn.Identity()
+        inner, deep = (width if len(channels) > 1 else channels[0]), channels[-1]
+        self.score = nn.Conv2d(inner, keypoints, 1) if head == "sam" else None
+        self.fc = None if head == "sam" else _layers(deep, 256, 2 * keypoints)
+        # Of each keypoint: the features where it is looked for, those of the whole picture, and how
+        # widely it is looked for.
+        told = deep + (inner + 2 if head == "sam" else 0)
+        self.spread = nn.ModuleList([_layers(told, _HIDDEN, 3) for _ in range(keypoints)])  # two variances, visible
+        for layers in self.spread:
+            nn.init.constant_(layers[-1].bias[:2], _FIRST_LOG_VARIANCE)  # type: ignore[index]
+        self.present = _layers(deep, _HIDDEN, 1)
+        linked = _linked(keypoints, covariance)
+        self.register_buffer("linked", torch.eye(linked.numel())[linked.flatten()], persistent=False)  # (links, 4K²)
+        self.correlation = _layers(told * keypoints, _HIDDEN, int(linked.sum())) if linked.any() else None
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Means in [0, 1] and log-variances in px²."""
+    def forward(self, image: Tensor) -> Prediction:
+        """See the class."""
+        size = image.shape[-1]
         maps = self.backbone(image)
-        size = maps[0].shape[-2:]
-        fused = self.lateral[0](maps[0])
-        for layer, feature in zip(list(self.lateral)[1:], maps[1:], strict=True):
-            fused = fused + functional.interpolate(layer(feature), size=size, mode="bilinear", align_corners=False)
-        fused = self.fuse(fused)
-        attention = self.score(fused).flatten(2).softmax(dim=-1)  # (B, K, H W)
-        mean, spread = soft_argmax(attention, size[0], size[1])
-        return mean, self._variances(fused.flatten(2), attention, spread)
+        whole = maps[-1].float().mean(dim=(2, 3))
+        everywhere = whole[:, None].expand(-1, self.keypoints, -1)
+        if self.score is not None:
+            fused = self.neck(maps if len(maps) > 1 else maps[0])
+            attention = functional.log_softmax(self.score(fused).float().flatten(2), dim=-1)  # (B, K, H W)
+            weight = attention.exp()
+            mean, variance = soft_argmax(weight, *fused.shape[-2:])
+            local = weight @ fused.float().flatten(2).transpose(1, 2)  # (B, K, C)
+            told = torch.cat([local, everywhere, variance.clamp_min(1e-6).log()], dim=-1)
+            looked = attention.unflatten(2, fused.shape[-2:])
+        else:
+            assert self.fc is not None
+            mean = self.fc(whole).unflatten(1, (self.keypoints, 2)) + 0.5
+            told, looked = everywhere, None
+        spread = torch.stack([layers(told[:, k]) for k, layers in enumerate(self.spread)], dim=1)
+        sigma = (spread[..., :2].exp() + MIN_SIGMA_PX**2).sqrt()
+        return Prediction(
+            mean * size - 0.5, sigma, self._factor(told), spread[..., 2], self.present(whole)[:, 0], looked
+        )
 
-    def _variances(self, fused: Tensor, attention: Tensor, spread: Tensor) -> Tensor:
-        """Pool, linear (the exponential follows in the loss): pooled over the image and, for each
-        keypoint, where its attention lies, with the attention's own spread.
-        """
-        local = attention @ fused.transpose(1, 2)  # (B, K, C)
-        everywhere = fused.mean(dim=-1, keepdim=True).transpose(1, 2).expand_as(local)
-        pooled = torch.cat([local, everywhere, spread.clamp_min(1e-6).log()], dim=-1)
-        return torch.stack([layer(pooled[:, k]) for k, layer in enumerate(self.log_variance)], dim=1)
+    @property
+    def means(self) -> list[nn.Module]:
+        """The parts that the means come from; the others say how sure they are, and whether there is a runway."""
+        return [part for part in (self.backbone, self.neck, self.score, self.fc) if part is not None]
+
+    def _factor(self, told: Tensor) -> Tensor | None:
+        """The correlation's Cholesky factor: a unit lower triangle, its rows scaled to length one."""
+        if self.correlation is None:
+            return None
+        n = 2 * self.keypoints
+        below = self.correlation(told.flatten(1)) @ self.linked
+        lower = below.unflatten(1, (n, n)) + torch.eye(n, device=told.device)
+        factor: Tensor = lower / lower.norm(dim=2, keepdim=True)
+        return factor
+
+
+class Neck(nn.Module):
+    """Feature maps (shallow to deep) to one of the shallowest's size, `width` channels: from deep to
+    shallow, each is added to what came from below and smoothed.
+    """
+
+    def __init__(self, channels: Sequence[int], width: int) -> None:
+        super().__init__()
+        self.lateral = nn.ModuleList([nn.Conv2d(c, width, 1, bias=False) for c in channels])
+        self.smooth = nn.ModuleList([
+            nn.Sequential(
+                nn.BatchNorm2d(width), nn.Hardswish(),
+                nn.Conv2d(width, width, 3, padding=1, groups=width, bias=False), nn.BatchNorm2d(width),
+                nn.Conv2d(width, width, 1, bias=False), nn.BatchNorm2d(width), nn.Hardswish(),
+            )
+            for _ in channels
+        ])  # fmt: skip
+
+    def forward(self, maps: Sequence[Tensor]) -> Tensor:
+        """The fused map (B, width, H, W)."""
+        fused: Tensor | None = None
+        for lateral, smooth, feature in zip(
+            reversed(list(self.lateral)), reversed(list(self.smooth)), reversed(maps), strict=True
+        ):
+            here = lateral(feature)
+            if fused is not None:
+                here = here + functional.interpolate(fused, size=here.shape[-2:], mode="bilinear", align_corners=False)
+            fused = smooth(here)
+        assert fused is not None
+        return fused
 
 
 def soft_argmax(attention: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -92,21 +171,34 @@ def soft_argmax(attention: Tensor, height: int, width: int) -> tuple[Tensor, Ten
     return mean, attention @ grid.square() - mean.square()
 
 
-def to_pixels(mean: Tensor, size: int) -> Tensor:
-    """Means in [0, 1] to pixels of a square image of side `size`: the left edge is at -1/2."""
-    return mean * size - 0.5
+def _backbone(name: str, features: Sequence[int], pretrained: bool) -> tuple[nn.Module, list[int]]:
+    """timm's model giving the last map of each stride, and the maps' channels; shallow to deep."""
+    wanted = sorted(set(features))
+    try:
+        probe: Any = timm.create_model(name, features_only=True, pretrained=False)
+    except (RuntimeError, AttributeError) as error:  # timm's: no such model, or one without feature maps
+        raise InputError(f"backbone: {name!r}: {str(error).strip().splitlines()[0]}") from error
+    every: list[int] = probe.feature_info.reduction()
+    if not wanted or not set(wanted) <= set(every):
+        raise InputError(
+            f"features: {name!r} has the strides {', '.join(map(str, sorted(set(every))))}; "
+            f"{', '.join(map(str, wanted)) or 'at least one'} wanted"
+        )
+    taken = [len(every) - 1 - every[::-1].index(stride) for stride in wanted]
+    model: Any = timm.create_model(name, features_only=True, pretrained=pretrained, out_indices=taken)
+    return model, model.feature_info.channels()
 
 
-def variance_px(log_variance: Tensor) -> Tensor:
-    """px², bounded away from zero."""
-    return log_variance.exp() + MIN_SIGMA_PX**2
+def _layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.Hardswish(), nn.Linear(hidden, outputs))
 
 
-def gaussian_nll(error_px: Tensor, log_variance: Tensor) -> Tensor:
-    """Mean over coordinates of e²/(2 s²) + ln(s²)/2.
-
-    With the half on both terms; as printed in the paper (none on the logarithm) the optimum is
-    s² = e²/2, which is overconfident by the square root of two.
-    """
-    variance = variance_px(log_variance)
-    return 0.5 * (error_px.square() / variance + variance.log()).mean()
+def _linked(keypoints: int, covariance: Covariance) -> Tensor:
+    """Which entries below the diagonal of the (2K, 2K) correlation factor are predicted."""
+    below = torch.ones(2 * keypoints, 2 * keypoints).tril(-1).bool()
+    if covariance == "full":
+        return below
+    if covariance == "diagonal":
+        return torch.zeros_like(below)
+    same: Tensor = torch.block_diag(*[torch.ones(2, 2)] * keypoints).bool()
+    return below & same

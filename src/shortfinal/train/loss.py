@@ -1,0 +1,96 @@
+"""What training minimises: the Gaussian negative log-likelihood, in forms to compare, and what helps it on its way."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from shortfinal.errors import InputError
+from shortfinal.train.model import Prediction
+
+Likelihood = Literal["half", "published", "beta"]
+
+_BETA = 0.5  # Seitzer et al. 2022, arXiv 2203.09168
+_TARGET_CELLS = 1.0  # standard deviation of the attention's target, in cells of its map
+
+
+def gaussian_nll(
+    error_px: Tensor,
+    sigma_px: Tensor,
+    factor: Tensor | None = None,
+    visible: Tensor | None = None,
+    likelihood: Likelihood = "half",
+) -> Tensor:
+    """The loss (B,) of errors (B, K, 2): the sum over the visible keypoints of each picture.
+
+    "half", the negative log-likelihood, without its constant: e' S^-1 e / 2 + ln|S| / 2. "published"
+    (arXiv 2508.09732, the loss as printed): ln|S| without its half; the best S is then half the
+    errors' covariance, overconfident by the square root of two. "beta" (arXiv 2203.09168): each
+    coordinate's "half" times its sigma^(2 * 0.5), not differentiated, so that what is uncertain
+    still learns. S: from `sigma_px` (B, K, 2) and the `factor` (B, 2K, 2K) of its correlation.
+    Keypoints that are not `visible` (B, K) are marginalised out. Raises InputError for another
+    likelihood, or "beta" with correlations.
+    """
+    if likelihood not in get_args(Likelihood):
+        raise InputError(f"likelihood: {likelihood!r}; expected one of {', '.join(get_args(Likelihood))}")
+    seen = (torch.ones_like(error_px[..., 0]) if visible is None else visible.to(error_px))[..., None]
+    seen = seen.expand_as(error_px).flatten(1)
+    scaled, log_variance = (error_px / sigma_px).flatten(1) * seen, 2 * sigma_px.log().flatten(1) * seen
+    log_weight = 1.0 if likelihood == "published" else 0.5
+    if factor is None:
+        each = 0.5 * scaled.square() + log_weight * log_variance
+        if likelihood == "beta":
+            each = each * sigma_px.detach().flatten(1) ** (2 * _BETA)
+        return each.sum(dim=1)
+    if likelihood == "beta":
+        raise InputError("likelihood: beta weighs coordinates one by one; it needs a diagonal covariance")
+    if visible is not None:
+        factor = _of_the_seen(factor, seen)
+    white: Tensor = torch.linalg.solve_triangular(factor, scaled[..., None], upper=False)[..., 0]
+    log_det = 2 * factor.diagonal(dim1=1, dim2=2).abs().log().sum(dim=1) + log_variance.sum(dim=1)
+    return 0.5 * white.square().sum(dim=1) + log_weight * log_det
+
+
+def _of_the_seen(factor: Tensor, seen: Tensor) -> Tensor:
+    """A lower triangular factor (B, n, n) of the correlation in which what is not `seen` (B, n) is a unit normal apart.
+
+    By QR of the factor's own rows: forming the correlation would square its condition number, and a
+    Cholesky factorisation of it fail where coordinates are nearly the same.
+    """
+    rows = torch.cat([factor * seen[:, :, None], torch.diag_embed(1.0 - seen)], dim=2)
+    upper: Tensor = torch.linalg.qr(rows.transpose(1, 2)).R
+    return upper.transpose(1, 2)
+
+
+def attention_loss(attention: Tensor, corners_px: Tensor, visible: Tensor, size: int) -> Tensor:
+    """The loss (B,): cross-entropy of log-attention (B, K, H, W) and a Gaussian one cell wide at the truth.
+
+    Attention is where the network looks for a keypoint; told so directly it learns in a fraction of
+    the steps that the soft argmax alone, which only knows the mean, needs (cf. Nibali et al. 2018,
+    arXiv 1801.07372, who regularise the same way).
+    """
+    height, width = attention.shape[-2:]
+    target = (
+        _bump(corners_px[..., 0], size, width)[..., None, :] * _bump(corners_px[..., 1], size, height)[..., :, None]
+    )
+    return -(target * attention).sum(dim=(2, 3)).mul(visible).sum(dim=1)
+
+
+def _bump(place_px: Tensor, size: int, cells: int) -> Tensor:
+    """Weights (B, K, cells) that sum to one, a Gaussian around each place (B, K)."""
+    centre = (torch.arange(cells, device=place_px.device) + 0.5) * (size / cells) - 0.5
+    offset = (place_px[..., None] - centre) / (_TARGET_CELLS * size / cells)
+    return torch.softmax(-0.5 * offset.square(), dim=-1)
+
+
+def scope_loss(prediction: Prediction, visible: Tensor) -> Tensor:
+    """The loss (B,): is each keypoint in the picture, and is a runway?"""
+    present = visible.any(dim=1).to(prediction.present)
+    each = functional.binary_cross_entropy_with_logits(
+        prediction.visible, visible.to(prediction.visible), reduction="none"
+    )
+    whole = functional.binary_cross_entropy_with_logits(prediction.present, present, reduction="none")
+    return each.mean(dim=1) + whole

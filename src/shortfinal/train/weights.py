@@ -1,0 +1,154 @@
+"""Pretrained backbones from a local file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from shortfinal.errors import InputError
+
+FOLDED_MEAN = FOLDED_STD = (0.5, 0.5, 0.5)  # of RGB / 255, that `load_folded_mobilenet`'s file was trained with
+
+
+def load_weights(backbone: nn.Module, path: str | Path, pictures: Tensor) -> None:
+    """A backbone's pretrained weights from a file: MobileNetV2's (.npz, see below), or torch's or safetensors'.
+
+    The latter may hold more than the backbone has (its classifier), under timm's names. `pictures`
+    (B, 3, S, S) as the network sees them settle folded batch norms. Raises InputError if the file is
+    missing, or lacks something that the backbone has.
+    """
+    if Path(path).suffix == ".npz":
+        load_folded_mobilenet(backbone, path)
+        settle_batch_norm(backbone, pictures)
+        return
+    given = {_plain(name): value for name, value in _read_tensors(path).items()}
+    mine = backbone.state_dict()
+    fitting = {
+        name: given[_plain(name)]
+        for name, weight in mine.items()
+        if _plain(name) in given and given[_plain(name)].shape == weight.shape
+    }
+    # Older files do not count the batches that a batch norm saw; nothing here does either.
+    lacking = [name for name in mine if name not in fitting and not name.endswith("num_batches_tracked")]
+    if lacking:
+        raise InputError(
+            f"{path}: fits {len(mine) - len(lacking)} of the backbone's {len(mine)} tensors, not {lacking[0]}; "
+            "is it of another network?"
+        )
+    backbone.load_state_dict(fitting, strict=False)
+
+
+def _plain(name: str) -> str:
+    """The name of a tensor, of timm's whole model or of the same as a backbone, which names stages otherwise."""
+    return name.removeprefix("model.").replace(".", "_")
+
+
+def _read_tensors(path: str | Path) -> dict[str, Tensor]:
+    try:
+        if Path(path).suffix == ".safetensors":
+            from safetensors.torch import load_file  # timm's own dependency
+
+            state = load_file(path)
+        else:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the weights: {error.strerror or error}") from error
+    except Exception as error:  # both raise many kinds for a file that is not their own
+        raise InputError(f"{path}: not a file of weights: {first_line(error)}") from error
+    if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
+        state = state["state_dict"]
+    tensors = {k: v for k, v in state.items() if isinstance(v, Tensor)} if isinstance(state, dict) else {}
+    if not tensors:
+        raise InputError(f"{path}: holds no tensors by name; expected the state_dict of a timm model")
+    return tensors
+
+
+def first_line(error: BaseException) -> str:
+    """What an error of somebody else's says, as part of a line of ours."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0][:160]
+
+
+def load_folded_mobilenet(model: nn.Module, path: str | Path) -> None:
+    """Weights of TensorFlow's MobileNetV2, batch norm folded in, into timm's `mobilenetv2_100`.
+
+    The file (.npz) has `NNN_..._w` (OHWI; depthwise 1, H, W, C) and `NNN_..._b` in the order of the
+    layers, for inputs (RGB - 127.5) / 127.5 and TensorFlow's padding ("same": timm's `pad_type`). A
+    model cut short (`features_only`) takes as many as it has. Each batch norm gets the layer's bias
+    and statistics of a standard normal, so that in evaluation it adds the bias and does no more;
+    `settle_batch_norm` then makes it fit to train with.
+    Raises InputError if the file is missing, or is not of this network; the model then stays as it was.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            arrays = {name: content[name] for name in content.files}
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: cannot read the weights: {error.strerror}") from error
+    except Exception as error:  # numpy, zipfile and zlib each have their own for a damaged file
+        raise InputError(f"{path}: cannot read the weights: {first_line(error)}") from error
+    kernels = [arrays[name] for name in sorted(arrays) if name.endswith("_w")]
+    biases = [arrays[name] for name in sorted(arrays) if name.endswith("_b")]
+    layers: list[Any] = [m for m in model.modules() if isinstance(m, (nn.Conv2d, nn.Linear))]
+    norms: list[Any] = [m for m in model.modules() if isinstance(m, nn.BatchNorm2d)]
+    if not norms or len(layers) > min(len(kernels), len(biases)):
+        raise InputError(f"{path}: holds {min(len(kernels), len(biases))} layers; the network has {len(layers)}")
+    weights = [_unfolded(layer, kernel) for layer, kernel in zip(layers, kernels, strict=False)]
+    for number, (layer, weight, bias) in enumerate(zip(layers, weights, biases, strict=False)):
+        adds = number < len(norms) or layer.bias is not None
+        if weight.shape != layer.weight.shape or bias.shape != weight.shape[:1] or not adds:
+            raise InputError(
+                f"{path}: layer {number} is {tuple(weight.shape)}; the network's is {tuple(layer.weight.shape)}"
+            )
+    with torch.no_grad():
+        for number, (layer, weight, bias) in enumerate(zip(layers, weights, biases, strict=False)):
+            layer.weight.copy_(weight)
+            if number >= len(norms):
+                layer.bias.copy_(torch.from_numpy(bias))
+                continue
+            norm = norms[number]
+            norm.running_mean.zero_()
+            norm.running_var.fill_(1.0)
+            norm.weight.fill_((1.0 + norm.eps) ** 0.5)
+            norm.bias.copy_(torch.from_numpy(bias))
+
+
+def _unfolded(layer: Any, kernel: np.ndarray[Any, Any]) -> Tensor:
+    """A kernel of TensorFlow's in torch's order of axes."""
+    if kernel.ndim != 4:
+        return torch.from_numpy(kernel)
+    depthwise = isinstance(layer, nn.Conv2d) and layer.groups > 1
+    moved = torch.from_numpy(np.ascontiguousarray(kernel.transpose((3, 0, 1, 2) if depthwise else (0, 3, 1, 2))))
+    return moved.flatten(1) if isinstance(layer, nn.Linear) else moved
+
+
+def settle_batch_norm(model: nn.Module, pictures: Tensor) -> None:
+    """Give each batch norm the mean and variance of what it sees, and undo them in its weight and bias.
+
+    What the network computes stays as it is; but in training, where a batch norm uses the batch's own
+    statistics, it now starts from about the same function instead of another one.
+    """
+
+    def measure(norm: Any, inputs: tuple[Tensor, ...]) -> None:
+        (seen,) = inputs
+        mean, variance = seen.mean(dim=(0, 2, 3)), seen.var(dim=(0, 2, 3), unbiased=False)
+        gain = norm.weight / (norm.running_var + norm.eps).sqrt()
+        norm.bias += gain * (mean - norm.running_mean)
+        norm.weight.copy_(gain * (variance + norm.eps).sqrt())
+        norm.running_mean.copy_(mean)
+        norm.running_var.copy_(variance)
+
+    norms = [module for module in model.modules() if isinstance(module, nn.BatchNorm2d)]
+    hooks = [norm.register_forward_pre_hook(measure) for norm in norms]
+    was = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            model(pictures)
+    finally:
+        for hook in hooks:
+            hook.remove()
+        model.train(was)

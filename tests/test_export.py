@@ -1,0 +1,222 @@
+import numpy as np
+import pytest
+from small import labelled_folder
+
+import shortfinal as sf
+from shortfinal.errors import JobError
+
+torch = pytest.importorskip("torch")
+
+from torch.optim.swa_utils import AveragedModel  # noqa: E402
+
+from shortfinal.train import export as module  # noqa: E402
+from shortfinal.train.export import LIMITS, Difference, export, load_network, random_pictures  # noqa: E402
+from shortfinal.train.model import KeypointNet  # noqa: E402
+from shortfinal.train.recipe import Recipe, to_dict  # noqa: E402
+
+SIZE = 64
+
+
+def checkpoint(path, keypoints=sf.CORNER_NAMES, sharp=300.0, **network):
+    """Write one of a small network with random weights; its attention is `sharp`, and follows the picture."""
+    recipe = Recipe(("/home/somebody/pictures",), backbone="mobilenetv3_small_050", features=(8, 16, 32), width=16,
+                    size=SIZE, keypoints=keypoints, mean=(0.4, 0.5, 0.6), **network)  # fmt: skip
+    torch.manual_seed(0)
+    net = KeypointNet(recipe.backbone, len(keypoints), recipe.head, recipe.covariance, recipe.features, recipe.width)
+    with torch.no_grad():
+        for name, weight in net.named_parameters():
+            if name.startswith(("score", "spread", "correlation", "present", "fc")):
+                weight *= sharp if name == "score.weight" else 3.0
+    average = AveragedModel(net)
+    parts = {"net": net.state_dict(), "average": average.state_dict(), "optimizer": {}, "schedule": {}}
+    history = [{"median_px": 9.0}, {"step": 4.0, "median_px": 1.5, "far_median_px": float("nan")}]
+    torch.save(parts | {"step": 4, "history": history, "recipe": to_dict(recipe)}, path)
+    return path
+
+
+def answers(path, pictures):
+    """mean (N, K, 2), cov (N, 2K, 2K), visible (N, K) and present (N,) as the file has them."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    return session.run(["mean_px", "cov_px", "visible", "present"], {"image": pictures})
+
+
+def told(path, pictures):
+    """The same by torch, from the network itself; beside them its sigmas (N, K, 2)."""
+    network, _ = load_network(path)
+    with torch.inference_mode():
+        p = network.net(torch.from_numpy(pictures))
+    return p.mean_px, p.cov_px, p.visible.sigmoid(), p.present.sigmoid(), p.sigma_px
+
+
+@pytest.fixture(scope="module", autouse=True)
+def traced_once():
+    """Tracing takes seconds: the same network is traced once."""
+    trace, models = module.to_onnx, {}
+
+    def to_onnx(network, size):
+        key = tuple((name, weight.double().sum().item()) for name, weight in network.state_dict().items())
+        models[key] = models.get(key) or trace(network, size)
+        copy = type(models[key])()
+        copy.CopyFrom(models[key])
+        return copy
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "to_onnx", to_onnx)
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("export")
+    labelled_folder(path / "data", 32)
+    checkpoint(path / "best.pt")
+    return path
+
+
+SEVEN = (*sf.CORNER_NAMES, "a", "b", "c")
+NETWORKS = [
+    pytest.param({"covariance": "full", "keypoints": SEVEN}, id="full-covariance-of-seven"),
+    pytest.param({"covariance": "keypoint"}, id="covariance-of-each-keypoint", marks=pytest.mark.slow),
+    pytest.param({"covariance": "full", "head": "fc"}, id="fc-head", marks=pytest.mark.slow),
+    pytest.param({"head": "fc", "keypoints": SEVEN}, id="fc-head-of-seven", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+def test_the_file_answers_as_torch_for_any_number_of_pictures(tmp_path, network):
+    path = checkpoint(tmp_path / "best.pt", **network)
+    info = export(path, tmp_path / "model.onnx")
+    k = len(info.keypoints)
+    for count in (1, 5):
+        pictures = random_pictures(SIZE, count, seed=count)
+        *wanted, sigma = told(path, pictures)
+        given = answers(tmp_path / "model.onnx", pictures)
+        assert [a.shape[1:] for a in given] == [(k, 2), (2 * k, 2 * k), (k,), ()]
+        variance = np.diagonal(given[1], axis1=1, axis2=2)
+        unit = [1.0, np.sqrt(variance[:, :, None] * variance[:, None, :]), 1.0, 1.0]
+        for mine, true, one in zip(given, wanted, unit):
+            # float32: 1e-5 of the side, in pixels; a thousandth of a correlation.
+            np.testing.assert_allclose(mine / one, true / one, rtol=1e-4, atol=max(1e-5 * SIZE, 1e-3))
+        np.testing.assert_allclose(np.sqrt(variance), sigma.flatten(1), rtol=1e-4)
+        correlation = given[1] / np.sqrt(variance[:, :, None] * variance[:, None, :])
+        assert (np.abs(np.tril(correlation, -1)).max() > 0.1) == (info.covariance != "diagonal")
+    detector = sf.KeypointDetector(tmp_path / "model.onnx")
+    assert detector.info == info
+    detector.detect(np.zeros((SIZE, SIZE, 3), np.uint8), sf.PixelWindow(0, 0, SIZE, SIZE, SIZE, SIZE))
+
+
+def test_export_describes_itself(folder, tmp_path):
+    info = export(folder / "best.pt", tmp_path / "model.onnx", data=folder / "data")
+    assert sf.KeypointDetector(tmp_path / "model.onnx").info == info
+    assert (info.keypoints, info.covariance, info.precision) == (sf.CORNER_NAMES, "diagonal", "fp32")
+    assert (info.size, info.mean, info.calibration) == (SIZE, (0.4, 0.5, 0.6), None)
+    assert info.training == {
+        "data": ["pictures"], "steps": 4, "batch": 32, "seed": 0, "head": "sam", "features": [8, 16, 32], "width": 16
+    }  # fmt: skip
+    assert info.figures["median_px"] == 1.5  # of the last validation
+    assert "far_median_px" not in info.figures  # JSON has no NaN
+    content = (tmp_path / "model.onnx").read_bytes()
+    for trace in (str(tmp_path), "/home", ".py"):  # of where it was made
+        assert trace.encode() not in content
+
+
+def test_half_the_digits_in_the_backbone_only(folder, tmp_path):
+    info = export(folder / "best.pt", tmp_path / "model.onnx", "fp16")
+    assert sf.KeypointDetector(tmp_path / "model.onnx").info == info
+    assert info.precision == "fp16"
+    pictures = random_pictures(SIZE, 8, seed=4)
+    mean, cov, *_ = answers(tmp_path / "model.onnx", pictures)
+    true_mean, true_cov, *_ = told(folder / "best.pt", pictures)
+    off = np.abs(mean - true_mean.numpy())
+    assert 1e-5 < off.max() < 0.05
+    assert not np.array_equal(mean, mean.astype(np.float16))  # coordinates are not rounded to it
+    np.testing.assert_allclose(np.diagonal(cov, axis1=1, axis2=2), np.diagonal(true_cov, axis1=1, axis2=2), rtol=0.02)
+
+
+def test_int8_loses_no_more_than_it_may(folder, tmp_path):
+    info = export(folder / "best.pt", tmp_path / "model.onnx", "int8", folder / "data")
+    assert sf.KeypointDetector(tmp_path / "model.onnx").info == info
+    assert info.precision == "int8"
+    assert 0 < info.figures["int8_share"] <= 1
+    assert 1e-4 < info.figures["export_mean_px"] <= LIMITS["int8"].mean_px
+    import onnx
+
+    graph = onnx.load(tmp_path / "model.onnx").graph
+    eight_bit = {t.name for t in graph.initializer if t.data_type == onnx.TensorProto.INT8}
+    assert any("backbone" in name for name in eight_bit)
+    assert not any(part in name for name in eight_bit for part in ("net.neck", "net.score", "net.spread"))
+
+
+def test_int8_that_loses_more_is_not_offered(folder, tmp_path, monkeypatch):
+    monkeypatch.setitem(LIMITS, "int8", Difference(1e-5, 1.0, 1.0))
+    message = (
+        r"in int8 it differs from torch by \S+ px, \S+ of sigma, \S+ of probability; allowed are 1e-05 px, .*written"
+    )
+    with pytest.raises(JobError, match=message):
+        export(folder / "best.pt", tmp_path / "model.onnx", "int8", folder / "data")
+    assert not (tmp_path / "model.onnx").exists()
+
+
+@pytest.mark.parametrize("part", ["score.weight", "spread.0.2.bias", "present.2.bias"])
+def test_a_file_that_differs_from_torch_is_not_written(folder, tmp_path, monkeypatch, part):
+    from onnx import numpy_helper
+
+    trace = module.to_onnx
+
+    def another(network, size):
+        model = trace(network, size)
+        (weight,) = (t for t in model.graph.initializer if t.name.endswith(part))
+        weight.CopyFrom(
+            numpy_helper.from_array(np.float32(1.01) * numpy_helper.to_array(weight) + np.float32(0.01), weight.name)
+        )
+        return model
+
+    monkeypatch.setattr(module, "to_onnx", another)
+    with pytest.raises(JobError, match="in fp32 it differs from torch"):
+        export(folder / "best.pt", tmp_path / "model.onnx")
+    assert not (tmp_path / "model.onnx").exists()
+
+
+@pytest.mark.parametrize("content", [None, b"nonsense"])
+def test_what_is_no_checkpoint_is_refused(tmp_path, content):
+    path = tmp_path / "x.pt"
+    if content:
+        path.write_bytes(content)
+    with pytest.raises(sf.InputError, match=r"x\.pt: "):
+        export(path, tmp_path / "y.onnx")
+    assert not (tmp_path / "y.onnx").exists()
+
+
+def test_a_checkpoint_that_lacks_something_is_refused(tmp_path):
+    torch.save({"recipe": {}, "net": {}}, tmp_path / "x.pt")
+    with pytest.raises(sf.InputError, match=r"x\.pt: not a complete checkpoint: lacks average, optimizer"):
+        export(tmp_path / "x.pt", tmp_path / "y.onnx")
+
+
+def test_weights_of_another_network_are_refused(folder, tmp_path):
+    state = torch.load(folder / "best.pt", weights_only=True)
+    state["recipe"]["width"] = 24
+    torch.save(state, tmp_path / "x.pt")
+    with pytest.raises(sf.InputError, match=r"x\.pt: its weights are not those of the network in its recipe"):
+        export(tmp_path / "x.pt", tmp_path / "y.onnx")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("model.onnx", "int4"), "precision: 'int4'; expected one of fp32, fp16, int8"),
+        (("model.onnx", "int8"), "int8 needs a data set"),
+        (("absent/model.onnx",), "no such folder .*absent; make it first"),
+        (("",), "cannot be written: Is a directory"),
+        (("model.onnx", "int8", "few"), "few: 15 runways; at least 16 are needed"),
+        (("model.onnx", "fp32", "nowhere"), "nowhere: no such folder"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(folder, tmp_path, arguments, message):
+    labelled_folder(tmp_path / "few", 15)
+    out, precision, data = (*arguments, "fp32", None)[:3] if len(arguments) == 1 else (*arguments, None)[:3]
+    with pytest.raises(sf.InputError, match=message):
+        export(folder / "best.pt", tmp_path / out, precision, data and tmp_path / data)
+    assert not (tmp_path / "model.onnx").exists()

@@ -1,0 +1,51 @@
+"""The latency benchmark: calls take turns, both runtimes compute the same, and the table says what was measured."""
+
+import time
+
+import numpy as np
+import pytest
+
+from shortfinal.detector import shipped_model
+
+pytest.importorskip("torch")
+
+BENCHMARK = "latency"
+
+
+@pytest.fixture(scope="module")
+def tiny(benchmark, tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "tiny.onnx"
+    benchmark.write_network(path, size=64, backbone="test_resnet", features=(32,))
+    return path
+
+
+def test_calls_take_turns(benchmark):
+    made = []
+    calls = {name: lambda name=name, ms=ms: (made.append(name), time.sleep(ms / 1e3)) for name, ms in
+             {"fast": 1, "slow": 20}.items()}  # fmt: skip
+    times = benchmark.measure(calls, rounds=5, warm_up=2)
+    assert [sorted(made[n : n + 2]) for n in range(0, 14, 2)] == [["fast", "slow"]] * 7
+    assert {len(values) for values in times.values()} == {5}
+    # A sleep lasts no less than asked for; how much longer is the machine's affair.
+    assert times["slow"].min() >= 20
+    assert times["fast"].min() >= 1
+
+
+def test_both_runtimes_compute_the_same(benchmark, tiny):
+    pytest.importorskip("openvino")
+    one, other = (load(tiny, 1)() for load in benchmark.RUNTIMES.values())
+    assert one.shape == (1, 4, 2)
+    np.testing.assert_allclose(one, other, rtol=0, atol=64 * 1e-5)  # export's tolerance, of the side
+
+
+def test_the_table_has_a_row_a_model_and_ratios_to_the_reference(benchmark, tiny):
+    models = {benchmark.REFERENCE: tiny, "ships": shipped_model()}
+    rows = benchmark.table(models, rounds=3, threads=1, warm_up=1)
+    for runtime in benchmark.RUNTIMES:
+        first, second = (row[runtime] for row in rows)
+        assert first["times_as_fast"] == 1.0
+        assert second["times_as_fast"] == pytest.approx(first["median_ms"] / second["median_ms"])
+        assert 0 < second["median_ms"] <= second["p99_ms"]
+    lines = benchmark.markdown(rows).splitlines()
+    assert len(lines) == 4
+    assert len({line.count("|") for line in lines}) == 1
