@@ -156,6 +156,7 @@ def test_a_calibration_reads_back_from_json():
     [
         (ERRORS[:19], SIGMA[:19], "19 of coordinate u of keypoint 0; at least 20"),
         (np.where([True, False], ERRORS[:30], np.nan), SIGMA[:30], "0 of coordinate v of keypoint 0"),
+        (ERRORS[:0], SIGMA[:0], "0 of coordinate u of keypoint 0"),
         (ERRORS[:30], SIGMA[:29], "does not match"),
         (ERRORS[:30, 0], SIGMA[:30, 0], "both are"),
         (ERRORS[:30] * np.inf, SIGMA[:30], "finite, or NaN"),

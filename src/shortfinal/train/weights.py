@@ -48,6 +48,7 @@ def _plain(name: str) -> str:
 
 
 def _read_tensors(path: str | Path) -> dict[str, Tensor]:
+    state: Any
     try:
         if Path(path).suffix == ".safetensors":
             from safetensors.torch import load_file  # timm's own dependency
