@@ -142,3 +142,20 @@ def test_the_parts_the_means_come_from_are_all_of_them():
 def test_what_cannot_be_built_is_named_in_one_line(options, message):
     with pytest.raises(sf.InputError, match=f"^{message}"):
         KeypointNet(**options)
+
+
+@pytest.mark.parametrize("head", ["sam", "fc"])
+@pytest.mark.parametrize("covariance", ["diagonal", "keypoint", "full"])
+def test_in_mixed_precision_places_keep_their_digits(head, covariance):
+    """bfloat16 knows places of 64 to 128 px to half a pixel: what is told must lie between those steps too."""
+    torch.manual_seed(0)
+    net = KeypointNet("test_efficientnet", 4, head, covariance, width=8).eval()
+    with torch.no_grad():
+        for part in net.means[-1].parameters():
+            part *= 30  # attention that looks somewhere
+        image = torch.randn(8, 3, 160, 160, generator=torch.Generator().manual_seed(1))
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            said = net(image)
+    assert all(part.dtype == torch.float32 for part in said if part is not None)
+    steps = said.mean_px / 0.25
+    assert ((steps - steps.round()).abs() > 0.02).float().mean() > 0.8

@@ -207,7 +207,7 @@ def test_a_corner_beyond_the_picture_is_not_visible_though_the_crop_reaches_ther
 
 
 def test_few_held_out_pictures_are_taken_from_all_of_them(recipe):
-    data = [marked(np.array([[60.0, 90], [80, 91], [75, 60], [66, 60]]) + k) for k in range(7)]
+    data = [marked(np.array([[60.0, 90], [80, 91], [75 - 2 * k, 60], [66, 60]])) for k in range(7)]
     held = fit._Held(data, dataclasses.replace(recipe, validation_count=3))
     assert len(held) == 3
     for index, number in enumerate((0, 2, 4)):
@@ -312,14 +312,18 @@ def test_a_run_leaves_its_curve_and_its_best(done):
     assert all(np.isfinite(float(value)) for row in rows for value in row.values())
 
 
-def test_tensorboard_has_the_validations(done):
+def on_tensorboard(out, name):
+    """Steps and values of a curve."""
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    out, _ = done
     events = accumulator.EventAccumulator(str(out / "tensorboard")).Reload()
-    history = load_checkpoint(out / "last.pt")["history"]
+    return [(event.step, event.value) for event in events.Scalars(name)]
+
+
+def test_tensorboard_has_the_validations(done):
+    history = load_checkpoint(done[0] / "last.pt")["history"]
     for name in ("nll", "median_px", "coverage_95", "present_auroc"):
-        found = [(event.step, event.value) for event in events.Scalars(name)]
-        assert found == [(row["step"], pytest.approx(row[name], rel=1e-6)) for row in history]  # float32 there
+        wanted = [(row["step"], pytest.approx(row[name], rel=1e-6)) for row in history]  # float32 there
+        assert on_tensorboard(done[0], name) == wanted
 
 
 class Killed(BaseException):
@@ -368,12 +372,17 @@ def test_a_killed_process_goes_on_to_the_same_curve(recipe, tmp_path):
     train(changed(recipe, tmp_path / "whole", **long))
     halves = changed(recipe, tmp_path / "halves", **long)
     with subprocess.Popen(command(halves, "-c", TRAINING), stdout=subprocess.DEVNULL) as process:
-        until = time.monotonic() + 300
-        while not (tmp_path / "halves" / "last.pt").exists() and process.poll() is None and time.monotonic() < until:
+        curve, until = tmp_path / "halves" / "log.csv", time.monotonic() + 300
+        while process.poll() is None and time.monotonic() < until:
+            if curve.exists() and len(curve.read_text().splitlines()) > 3:  # after the third validation
+                break
             time.sleep(0.01)
         process.send_signal(signal.SIGKILL)
     assert process.returncode == -signal.SIGKILL
-    assert load_checkpoint(tmp_path / "halves" / "last.pt")["step"] < 40
+    history = load_checkpoint(tmp_path / "halves" / "last.pt")["history"]
+    assert history[-1]["step"] < 40
+    shown = on_tensorboard(tmp_path / "halves", "nll")  # what is on the record was shown
+    assert shown[: len(history)] == [(row["step"], pytest.approx(row["nll"], rel=1e-6)) for row in history]
     train(halves)
     same_run(tmp_path / "whole", tmp_path / "halves")
 
@@ -440,6 +449,14 @@ def test_a_start_of_another_network_is_refused(recipe, done, tmp_path, changes, 
     recipe = changed(recipe, tmp_path, start=str(done[0] / "best.pt"), covariance="keypoint")
     with pytest.raises(sf.InputError, match=rf"best\.pt: of another network \({differs} differs\)$"):
         train(dataclasses.replace(recipe, **changes))
+
+
+def test_a_start_that_lacks_a_weight_is_refused(recipe, done, tmp_path):
+    state = load_checkpoint(done[0] / "best.pt")
+    del state["average"]["module.present.0.weight"]
+    torch.save(state, tmp_path / "x.pt")
+    with pytest.raises(sf.InputError, match=r"x\.pt: of another network \(present\.0\.weight differs\)$"):
+        train(changed(recipe, tmp_path / "run", start=str(tmp_path / "x.pt"), covariance="keypoint"))
 
 
 def test_learning_the_covariance_leaves_the_means_as_they_are(recipe, scenes, tmp_path):

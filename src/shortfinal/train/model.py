@@ -6,6 +6,7 @@ Where this departs from the paper: docs/paper.md. What was tried: docs/log.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -89,16 +90,19 @@ class KeypointNet(nn.Module):
 
     def forward(self, image: Tensor) -> Prediction:
         """See the class."""
-        size = image.shape[-1]
         maps = self.backbone(image)
-        whole = maps[-1].float().mean(dim=(2, 3))
+        fused = None if self.score is None else self.neck(maps if len(maps) > 1 else maps[0])
+        with _single_precision(image.device.type):
+            return self._answer(maps[-1].float(), None if fused is None else fused.float(), image.shape[-1])
+
+    def _answer(self, deepest: Tensor, fused: Tensor | None, size: int) -> Prediction:
+        whole = deepest.mean(dim=(2, 3))
         everywhere = whole[:, None].expand(-1, self.keypoints, -1)
-        if self.score is not None:
-            fused = self.neck(maps if len(maps) > 1 else maps[0])
-            attention = functional.log_softmax(self.score(fused).float().flatten(2), dim=-1)  # (B, K, H W)
+        if self.score is not None and fused is not None:
+            attention = functional.log_softmax(self.score(fused).flatten(2), dim=-1)  # (B, K, H W)
             weight = attention.exp()
             mean, variance = soft_argmax(weight, *fused.shape[-2:])
-            local = weight @ fused.float().flatten(2).transpose(1, 2)  # (B, K, C)
+            local = weight @ fused.flatten(2).transpose(1, 2)  # (B, K, C)
             told = torch.cat([local, everywhere, variance.clamp_min(1e-6).log()], dim=-1)
             looked = attention.unflatten(2, fused.shape[-2:])
         else:
@@ -187,6 +191,11 @@ def _backbone(name: str, features: Sequence[int], pretrained: bool) -> tuple[nn.
     taken = [len(every) - 1 - every[::-1].index(stride) for stride in wanted]
     model: Any = timm.create_model(name, features_only=True, pretrained=pretrained, out_indices=taken)
     return model, model.feature_info.channels()
+
+
+def _single_precision(device: str) -> AbstractContextManager[Any]:
+    """Where mixed precision ends: bfloat16's 8 bits would round a mean to half a pixel at 64, to one at 128."""
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
 
 
 def _layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
