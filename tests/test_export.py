@@ -77,7 +77,7 @@ def folder(tmp_path_factory):
 
 SEVEN = (*sf.CORNER_NAMES, "a", "b", "c")
 NETWORKS = [
-    pytest.param({"covariance": "full", "keypoints": SEVEN}, id="full-covariance-of-seven"),
+    pytest.param({"covariance": "full", "keypoints": SEVEN}, id="full-covariance-of-seven", marks=pytest.mark.slow),
     pytest.param({"covariance": "keypoint"}, id="covariance-of-each-keypoint", marks=pytest.mark.slow),
     pytest.param({"covariance": "full", "head": "fc"}, id="fc-head", marks=pytest.mark.slow),
     pytest.param({"head": "fc", "keypoints": SEVEN}, id="fc-head-of-seven", marks=pytest.mark.slow),

@@ -182,6 +182,7 @@ def fitted(warm_up, seed):
     return float(error), float((said.sigma_px / noise(x)).log().mean().exp())
 
 
+@pytest.mark.slow
 def test_means_first_is_what_keeps_the_variance_from_excusing_them():
     # Where the means are far off a large sigma is the quicker way down, and then they hardly learn: without
     # the schedule parts of the waves are missing in the end. (Of three seeds in two; with it in none.)

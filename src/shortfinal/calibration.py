@@ -99,7 +99,8 @@ def fit_calibration(errors: ArrayLike, sigma: ArrayLike, fitted_on: str) -> Cali
     e, s = np.asarray(errors, np.float64), np.asarray(sigma, np.float64)
     if e.ndim != 2 or e.shape != s.shape:
         raise InputError(f"sigma: shape {s.shape} does not match errors {e.shape}; both are (N, n)")
-    _check_positive(s)
+    if s.size:
+        _check_positive(s)
     if np.isinf(e).any():
         raise InputError("errors: every one must be finite, or NaN where there is none")
     columns = [np.sort(z[~np.isnan(z)]) for z in np.abs(e / s).T]
