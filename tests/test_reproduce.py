@@ -14,7 +14,7 @@ from shortfinal.files import csv_text
 
 torch = pytest.importorskip("torch")
 
-from shortfinal.train import reproduce  # noqa: E402
+from shortfinal.train import fit, reproduce  # noqa: E402
 from shortfinal.train.fit import load_checkpoint  # noqa: E402
 from shortfinal.train.reproduce import CELLS, markdown, reproduce_table1  # noqa: E402
 
@@ -183,7 +183,7 @@ def test_weights_that_cannot_be_had_are_named_before_anything_is_trained(data, t
     def offline(*_, pretrained=False, **__):
         raise ConnectionError("no route to the hub\nmore of it")
 
-    monkeypatch.setattr(reproduce, "KeypointNet", offline)
+    monkeypatch.setattr(fit, "KeypointNet", offline)
     with pytest.raises(
         sf.InputError, match=r"^weights: timm's of 'resnet18' [^\n]*no route to the hub\)[^\n]*weights=$"
     ):

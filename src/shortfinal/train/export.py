@@ -26,7 +26,7 @@ from shortfinal.data.dataset import read_dataset
 from shortfinal.detector import FORMAT, OUTPUTS, ModelInfo, Precision, crop_image, described, normalise
 from shortfinal.errors import InputError, JobError
 from shortfinal.files import write_whole
-from shortfinal.train.fit import load_checkpoint
+from shortfinal.train.fit import load_checkpoint, network_of, network_weights
 from shortfinal.train.model import KeypointNet
 
 Array = NDArray[np.float64]
@@ -81,15 +81,9 @@ def load_network(checkpoint: str | Path) -> tuple[Network, dict[str, Any]]:
     Raises InputError for a file that is no checkpoint, or whose weights are not of its recipe's network.
     """
     state = load_checkpoint(checkpoint)
-    recipe = state["recipe"]
-    net = KeypointNet(
-        recipe["backbone"], len(recipe["keypoints"]), recipe["head"], recipe["covariance"], recipe["features"],
-        recipe["width"],
-    )  # fmt: skip
-    # An averaged model's state is the network's, under "module.", and a count.
-    weights = {k.removeprefix("module."): v for k, v in state["average"].items() if k.startswith("module.")}
+    net = network_of(state["recipe"])
     try:
-        net.load_state_dict(weights)
+        net.load_state_dict(network_weights(state))
     except RuntimeError as error:
         raise InputError(f"{checkpoint}: its weights are not those of the network in its recipe") from error
     return Network(net).eval(), state

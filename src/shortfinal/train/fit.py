@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, Dataset
 
-from shortfinal.calibration import coverage
+from shortfinal.calibration import LEVELS, coverage
 from shortfinal.crops import box_around, centre_crop, native_crop
 from shortfinal.data.augment import augmented_crop, inside, within
 from shortfinal.data.dataset import Example, LabelledDataset, read_dataset
@@ -32,9 +32,8 @@ from shortfinal.geometry import PixelWindow
 from shortfinal.train.loss import attention_loss, gaussian_nll, scope_loss
 from shortfinal.train.model import KeypointNet, Prediction
 from shortfinal.train.recipe import Recipe, to_dict
-from shortfinal.train.weights import FOLDED_MEAN, FOLDED_STD, first_line, load_weights
+from shortfinal.train.weights import FOLDED_MEAN, FOLDED_STD, first_line, load_weights, reading
 
-LEVELS = (0.5, 0.68, 0.9, 0.95, 0.99)  # at which coverage is reported
 _RISE = 0.03  # share of the steps in which the learning rate rises
 
 
@@ -346,13 +345,18 @@ class Run:
         self.save("last.pt")  # last of all: what is lost by a kill before it is done again, not twice
 
 
+def network_of(recipe: Mapping[str, Any], *, pretrained: bool = False) -> KeypointNet:
+    """The network that a recipe's plain values (`to_dict`, or a checkpoint's) describe."""
+    return KeypointNet(
+        recipe["backbone"], len(recipe["keypoints"]), recipe["head"], recipe["covariance"], recipe["features"],
+        recipe["width"], pretrained=pretrained,
+    )  # fmt: skip
+
+
 def _network(recipe: Recipe, pretrained: bool) -> KeypointNet:
     """The recipe's network, once tried. Raises InputError for a backbone that has no weights, or not this size."""
     try:
-        net = KeypointNet(
-            recipe.backbone, len(recipe.keypoints), recipe.head, recipe.covariance, recipe.features, recipe.width,
-            pretrained=pretrained,
-        )  # fmt: skip
+        net = network_of(to_dict(recipe), pretrained=pretrained)
         with torch.no_grad():
             net.eval()(torch.zeros(1, 3, recipe.size, recipe.size))
     except InputError:
@@ -398,12 +402,8 @@ def _averaging(decay: float) -> Callable[[Any, Any, Any], None]:
 
 def load_checkpoint(path: str | Path) -> dict[str, Any]:
     """The content of a checkpoint. Raises InputError if it is missing or not one of ours."""
-    try:
+    with reading(path, "checkpoint", "a checkpoint"):
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the checkpoint: {error.strerror or error}") from error
-    except Exception as error:  # torch raises many kinds for a file that is not a checkpoint
-        raise InputError(f"{path}: not a checkpoint: {first_line(error)}") from error
     if not isinstance(state, dict) or "recipe" not in state:
         raise InputError(f"{path}: a torch file, but not a checkpoint of shortfinal train")
     recipe = state["recipe"] if isinstance(state["recipe"], dict) else {}

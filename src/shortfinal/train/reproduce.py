@@ -23,8 +23,17 @@ from shortfinal.calibration import fit_sigma_scale
 from shortfinal.data.dataset import LabelledDataset
 from shortfinal.errors import InputError, JobError
 from shortfinal.files import make_folder, read_json, write_whole
-from shortfinal.train.fit import _Held, figures_of, load_checkpoint, network_weights, open_data, predict, train
-from shortfinal.train.model import Head, KeypointNet
+from shortfinal.train.fit import (
+    _Held,
+    figures_of,
+    load_checkpoint,
+    network_of,
+    network_weights,
+    open_data,
+    predict,
+    train,
+)
+from shortfinal.train.model import Head
 from shortfinal.train.recipe import Recipe, make_recipe, to_dict
 
 PAPER = "arXiv 2508.09732, table 1"
@@ -155,17 +164,10 @@ def _recipe(
     return make_recipe(preset, {"backbone": cell.backbone, **changed, **own})
 
 
-def _network(recipe: Recipe, *, pretrained: bool = False) -> KeypointNet:
-    return KeypointNet(
-        recipe.backbone, len(recipe.keypoints), recipe.head, recipe.covariance, recipe.features, recipe.width,
-        pretrained=pretrained,
-    )  # fmt: skip
-
-
 def _try_backbone(recipe: Recipe) -> None:
     """Raises InputError unless the backbone, and timm's weights of it where they are wanted, can be had."""
     try:
-        _network(recipe, pretrained=recipe.weights == "timm")
+        network_of(to_dict(recipe), pretrained=recipe.weights == "timm")
     except InputError:
         raise
     except Exception as error:  # timm's, torch's and the hub's have no base class in common
@@ -227,7 +229,7 @@ def _minutes(folder: Path) -> float:
 def _figures(recipe: Recipe, held: LabelledDataset) -> dict[str, float]:
     """Of best.pt on all held-out pictures; validations during training may have seen fewer."""
     device = Fabric(accelerator="auto").device
-    net = _network(recipe)
+    net = network_of(to_dict(recipe))
     net.load_state_dict(network_weights(load_checkpoint(Path(recipe.out) / "best.pt")))
     loader = DataLoader(
         _Held(held, replace(recipe, validation_count=len(held))), batch_size=50, num_workers=recipe.workers

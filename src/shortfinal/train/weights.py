@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -49,23 +51,30 @@ def _plain(name: str) -> str:
 
 def _read_tensors(path: str | Path) -> dict[str, Tensor]:
     state: Any
-    try:
+    with reading(path, "weights", "a file of weights"):
         if Path(path).suffix == ".safetensors":
             from safetensors.torch import load_file  # timm's own dependency
 
             state = load_file(path)
         else:
             state = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the weights: {error.strerror or error}") from error
-    except Exception as error:  # both raise many kinds for a file that is not their own
-        raise InputError(f"{path}: not a file of weights: {first_line(error)}") from error
     if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
         state = state["state_dict"]
     tensors = {k: v for k, v in state.items() if isinstance(v, Tensor)} if isinstance(state, dict) else {}
     if not tensors:
         raise InputError(f"{path}: holds no tensors by name; expected the state_dict of a timm model")
     return tensors
+
+
+@contextmanager
+def reading(path: str | Path, what: str, kind: str) -> Iterator[None]:
+    """What goes wrong while torch or safetensors read `what`, a file of this `kind`, as InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the {what}: {error.strerror or error}") from error
+    except Exception as error:  # both raise many kinds for a file that is not their own
+        raise InputError(f"{path}: not {kind}: {first_line(error)}") from error
 
 
 def first_line(error: BaseException) -> str:
