@@ -31,7 +31,8 @@ from shortfinal.errors import InputError, JobError
 
 if TYPE_CHECKING:
     from shortfinal.demo import Flown
-    from shortfinal.evaluate import Evaluation
+    from shortfinal.evaluate.frames import Evaluation as RunFigures
+    from shortfinal.evaluate.run import Evaluation
     from shortfinal.pipeline import FrameResult
 
 T = TypeVar("T")
@@ -279,6 +280,65 @@ def calibrate(
     console.print(f"written: {out or model}")
 
 
+@app.command()
+def evaluate(
+    subject: Annotated[Path, typer.Argument(help="Model file (.onnx), or predictions made elsewhere: .csv, or COCO's "
+                                                 "keypoint results (.json).")],
+    data: Annotated[Path, typer.Option(help="Labelled pictures: folder, or the file that holds or describes them.")],
+    out: Out = Path("results/evaluation"),
+    requirements: Annotated[Path | None, typer.Option(help="What must be shown (TOML); exit status 1 if it is not. "
+                                                           "See examples/requirements.toml.")] = None,
+    compare: Annotated[Path | None, typer.Option(help="Another model or file of predictions, beside it.")] = None,
+    runways: Runways = None,
+    camera: CameraFile = None,
+    corners: Corners = "",
+    origin: OriginName = "corner",
+    false_alarm_rate: Rate = 1e-3,
+    seed: Annotated[int, typer.Option(min=0, help="Of the faults that are planted.")] = 0,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    """Hold a model, or predictions, against labelled pictures: report, figures with intervals, evidence."""
+    from shortfinal.evaluate.figures import figures_of
+    from shortfinal.evaluate.judge import Rates
+    from shortfinal.evaluate.requirements import check, passed, read_requirements
+    from shortfinal.evaluate.run import Subject
+    from shortfinal.evaluate.run import evaluate as judge
+    from shortfinal.report.write import write_report
+    from shortfinal.stream.source import read_camera
+
+    wanted = read_requirements(requirements) if requirements else None
+    limits = wanted.alert_limits if wanted else None
+    given = read_camera(camera) if camera else None
+    if not as_json:
+        _compile(levels=True)
+    with _stages(quiet=as_json) as seen:
+
+        def held(path: Path, folder: Path) -> Evaluation:
+            return judge(
+                Subject(path), data, folder, runways=runways, camera=given, corners=_names(corners), origin=origin,
+                rates=Rates(false_alarm_rate), limits=limits, seed=seed, progress=seen,
+            )  # fmt: skip
+
+        made = held(subject, out)
+        evidence = made.evidence
+        if compare:
+            other = held(compare, out / "compared").evidence
+            evidence["compare"] = {
+                "name": compare.name, "metrics": [m for m in other["metrics"] if m["by"] == "all"],
+            }  # fmt: skip
+        if wanted:
+            evidence["requirements"] = check(wanted, made.rows, lambda rows: figures_of(rows, limits))
+        write_report(made, out, Subject(subject), data, requirements, seen)
+    if as_json:
+        _print_json({name: evidence[name] for name in ("counts", "metrics", "requirements", "notes")} | {"out": str(out)})
+    else:
+        _print_figures(evidence, out)
+    if wanted and not passed(evidence["requirements"]):
+        lacking = [f"{one['id']} {one['result']}" for one in evidence["requirements"] if one["result"] != "shown"]
+        raise JobError(f"{requirements}: {len(lacking)} of {len(wanted.requirements)} not met ({', '.join(lacking)}); "
+                       f"see {out}/report.html")  # fmt: skip
+
+
 @reproduce_app.command("table1")
 def reproduce_table1(
     data: Annotated[list[Path], typer.Option(help="Training pictures, as for train; the paper's are LARD v1's.")],
@@ -460,9 +520,9 @@ def _names(text: str) -> list[str]:
 
 def _run_folder(
     folder: Any, out: Path, model: Path | None, false_alarm_rate: float, *, quiet: bool
-) -> tuple[Evaluation, list[tuple[str, FrameResult]]]:
+) -> tuple[RunFigures, list[tuple[str, FrameResult]]]:
     from shortfinal.detector import KeypointDetector
-    from shortfinal.evaluate import evaluate
+    from shortfinal.evaluate.frames import evaluate
     from shortfinal.files import make_folder, write_png, write_whole
     from shortfinal.pipeline import LandingPipeline
     from shortfinal.stream.overlay import contact_sheet, draw_close_up
@@ -535,6 +595,23 @@ def _counter(what: str, *, quiet: bool) -> Iterator[Callable[[int, int], None] |
 
 
 @contextmanager
+def _stages(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """Bars moved by a function of (what is being done, how much is done, of so much), one for each thing done."""
+    if quiet:
+        yield lambda what, done, total: None
+        return
+    with _bar() as bar:
+        tasks: dict[str, Any] = {}
+
+        def seen(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=total)
+            bar.update(tasks[what], completed=done, total=total)
+
+        yield seen
+
+
+@contextmanager
 def _trials_bar(*, quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """A bar with rate and time left, moved by a function of (trials done, of so many)."""
     if quiet:
@@ -573,7 +650,7 @@ def _print_json(record: dict[str, Any]) -> None:
 def _table(title: str, columns: tuple[str, ...]) -> Table:
     table = Table(title=title or None, title_justify="left", box=None, pad_edge=False)
     for name in columns:
-        words = name in ("fault", "verdict", "why", "corners", "image")
+        words = name in ("fault", "verdict", "why", "corners", "image", "figure")
         table.add_column(name, justify="left" if words else "right", no_wrap=name != "why")
     return table
 
@@ -649,8 +726,8 @@ def _print_demo_summary(flown: list[Flown], out: Path) -> None:
     console.print(f"written: {out}/approach.mp4, contact_sheet.png, timeline.png, frames.jsonl")
 
 
-def _print_evaluation(evaluation: Evaluation) -> None:
-    from shortfinal.evaluate import rows
+def _print_evaluation(evaluation: RunFigures) -> None:
+    from shortfinal.evaluate.frames import rows
 
     decisions = ", ".join(f"{count} {name}" for name, count in evaluation.decisions.items())
     console.print(f"{evaluation.frames} frames: {decisions}")
@@ -666,6 +743,39 @@ def _print_evaluation(evaluation: Evaluation) -> None:
         console.print(
             f"distance error: median {e['median']:.1%}, 90 % {e['p90']:.1%} of {e['frames']:.0f} solved frames"
         )
+
+
+_SHOWN = (
+    ("use", "not_monitored", "alarm"), ("error_px.median", "error_px.q90", "far_error_px.median"),
+    ("coverage.68", "coverage.95", "nees"), ("along_m.median", "cross_m.median", "vertical_m.median", "over_level"),
+    ("detection.far_threshold_184m", "latency_ms.median"),
+)  # fmt: skip
+
+
+def _print_figures(evidence: dict[str, Any], out: Path) -> None:
+    """The figures that matter most, the requirements, and what a reader must know."""
+    overall = {m["name"]: m for m in evidence["metrics"] if m["by"] == "all"}
+    table = _table("", ("figure", "value", "95 % interval", "of"))
+    for names in _SHOWN:
+        for name in names:
+            if metric := overall.get(name):
+                ends = " – ".join("?" if end is None else f"{end:.3g}" for end in (metric["low"], metric["high"]))
+                table.add_row(name, f"{metric['value']:.3g} {metric['unit']}", ends, f"{metric['count']:,}")
+    console.print(f"{evidence['title']}: {evidence['counts']['labels']:,} labelled runways")
+    console.print(table)
+    for one in evidence["requirements"] or ():
+        console.print(Text(f"{one['id']}: {one['result']}: {one['why']}", style=_RESULTS[one["result"]]))
+    problems = evidence["counts"]["problems"]
+    if problems:
+        console.print(Text("problems: " + ", ".join(f"{count} {kind}" for kind, count in problems.items())))
+    for problem in evidence["problems"][:10]:
+        console.print(Text(f"  {problem['file']}: {problem['row']}: {problem['what']}"))
+    for note in evidence["notes"]:
+        console.print(Text(note))
+    console.print(f"written: {out}/report.html, evaluation.json, model_card.md, manifest.json, figures/")
+
+
+_RESULTS = {"shown": "green", "failed": "bold red", "not shown": "yellow"}
 
 
 def _print_refused(results: list[tuple[str, FrameResult]], most: int = 10) -> None:

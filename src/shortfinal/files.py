@@ -54,6 +54,23 @@ def read_json(path: str | Path, what: str) -> Any:
         raise InputError(f"{path}: not a JSON file: {error}") from error
 
 
+def claim(stamp: Path, made_of: Mapping[str, Any], otherwise: str) -> None:
+    """Note in a folder what its content follows from, as JSON in `stamp`; a folder of something else is refused.
+
+    Raises InputError that calls what is there `otherwise`.
+    """
+    text = json.dumps(made_of)
+    try:
+        there = stamp.read_text(encoding="utf-8") if stamp.exists() else text
+    except OSError as error:
+        raise InputError(f"{stamp}: cannot be read: {error.strerror}; choose an empty folder") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{stamp}: not a text file; choose an empty folder") from error
+    if there != text:
+        raise InputError(f"{stamp.parent}: holds {otherwise}; choose an empty folder or the same ones")
+    write_whole(stamp, text)
+
+
 def csv_text(columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> str:
     """A table with a header line, as text for `write_whole`."""
     text = io.StringIO()

@@ -146,7 +146,10 @@ class LandingPipeline:
             raise InputError(f"timestamp_s: {timestamp_s}; it must be finite")
         timings: dict[str, float] = {}
         try:
-            sight = _timed(timings, "detect_ms", lambda: self._look(frame_rgb, box, prior))
+            wide = None if box is not None else WIDE_MARGIN
+            sight = _timed(
+                timings, "detect_ms", lambda: see(self.detector, frame_rgb, self._first_box(box, prior), wide)
+            )
         except InputError as error:
             return FrameResult(timestamp_s, None, None, None, self._not_monitored(str(error)), None, timings)
         seen = (sight.look.present, sight.end_crops, *self._bounds(sight))
@@ -185,7 +188,7 @@ class LandingPipeline:
             false_alarm_rate=self.false_alarm_rate,
         )
 
-    def _bounds(self, sight: _Sight) -> tuple[str | None, Array | None]:
+    def _bounds(self, sight: Sight) -> tuple[str | None, Array | None]:
         calibration = self.detector.calibration
         if calibration is None:
             return None, None
@@ -194,53 +197,6 @@ class LandingPipeline:
 
     def _not_monitored(self, reason: str) -> IntegrityVerdict:
         return IntegrityVerdict(Decision.NOT_MONITORED, (reason,), 0, self.false_alarm_rate)
-
-    def _look(self, frame: Image, box: ArrayLike | None, prior: Pose | None) -> _Sight:
-        """Crop and detect; again where the runway was found, until the crop frames it; then at each end.
-
-        A network must name four corners, even of a runway that the crop cuts off, and it does so with
-        confidence. So what was found counts only if it lies well inside what was looked at.
-        """
-        margin, size = self.detector.info.margin, self.detector.info.size
-        wide = margin if box is not None else WIDE_MARGIN
-        window = centre_crop(self._first_box(box, prior), wide, size)
-        if crop_image(frame, window).std() < FLAT:
-            raise InputError("nothing to see: the crop is flat")
-        look = self.detector.look(frame, window)
-        for _ in range(LOOKS - 1):
-            if _frames(look, margin):
-                break
-            wider = margin if look.visible[:4].min() >= PRESENT else WIDE_MARGIN
-            look = self.detector.look(frame, centre_crop(box_around(look.keypoints.mean_px[:4]), wider, size))
-        if look.present < PRESENT:
-            return _Sight(look, look.keypoints, f"no runway in view (its probability is {look.present:.2g})")
-        if not _frames(look, margin):
-            return _Sight(look, look.keypoints, f"the runway does not settle inside the crop in {LOOKS} looks")
-        keypoints, end_crops = self._sharpened(frame, look)
-        return _Sight(look, keypoints, self._cut_off(keypoints), end_crops)
-
-    def _sharpened(self, frame: Image, look: Look) -> tuple[GaussianKeypoints, tuple[PixelWindow, ...]]:
-        """The keypoints with each end from a look of its own, where that shows it larger; and those looks' windows.
-
-        The crop that holds the whole of a near runway shows its far end, on which the monitor's power
-        rests, a few pixels wide. What two looks say of two ends is taken as independent.
-        """
-        known = look.keypoints
-        if look.window.scale[0] >= MAGNIFIED:
-            return known, ()
-        windows = {end: _around_end(known, end, self.detector.info.size) for end in range(len(ENDS))}
-        windows = {end: w for end, w in windows.items() if w.scale[0] > SHARPER * look.window.scale[0]}
-        if not windows:
-            return known, ()
-        mean, cov = known.mean_px.copy(), known.cov_px.copy()
-        for end, again in zip(windows, self.detector.look_all(frame, list(windows.values())), strict=True):
-            corners, rows = ENDS[end], slice(2 * ENDS[end].start, 2 * ENDS[end].stop)
-            if again.visible[corners].min() < PRESENT or not _holds(again.window, again.keypoints.mean_px[corners]):
-                continue  # the first look stands
-            mean[corners] = again.keypoints.mean_px[corners]
-            cov[rows], cov[:, rows] = 0.0, 0.0
-            cov[rows, rows] = again.keypoints.cov_px[rows, rows]
-        return GaussianKeypoints(mean, cov), tuple(windows.values())
 
     def _first_box(self, box: ArrayLike | None, prior: Pose | None) -> Array:
         if box is None:
@@ -253,29 +209,82 @@ class LandingPipeline:
             raise InputError(f"the runway's box {np.round(bounds).tolist()} lies outside the frame")
         return bounds
 
-    def _cut_off(self, keypoints: GaussianKeypoints) -> str:
-        """Which corner is at the frame's border, to within 2 sigma: it may lie beyond, unseen."""
-        reach = 2 * keypoints.sigma_px
-        last = np.array([self.camera.width - 1, self.camera.height - 1])
-        outside = ((keypoints.mean_px < reach) | (keypoints.mean_px > last - reach))[:4].any(axis=1)
-        if not outside.any():
-            return ""
-        return f"the {CORNER_NAMES[int(outside.argmax())]} corner lies at the border of the frame, or beyond it"
-
 
 @dataclass(frozen=True, eq=False)
-class _Sight:
+class Sight:
     """What was seen of a frame: the look at the whole runway, the keypoints, and what is in the way, if anything."""
 
     look: Look
-    keypoints: GaussianKeypoints  # all of the model's
-    obstacle: str
+    keypoints: GaussianKeypoints  # all of the model's, in the frame's pixels
+    obstacle: str  # why the keypoints are not to be used; nothing if they may be
     end_crops: tuple[PixelWindow, ...] = ()
 
     @property
     def seen(self) -> NDArray[np.bool_]:
         """Which keypoints take part (K,): the corners, and of the further ones those that are in view."""
         return np.asarray((self.look.visible >= PRESENT) | (np.arange(len(self.look.visible)) < 4))
+
+
+def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float | None = None) -> Sight:
+    """Crop and detect; again where the runway was found, until the crop frames it; then at each end.
+
+    `box` (4,): left, top, right, bottom around the runway, in the frame's pixels; `margin` of the first
+    crop around it, the model's own if not given. A network must name four corners, even of a runway that
+    the crop cuts off, and it does so with confidence. So what was found counts only if it lies well inside
+    what was looked at. Raises InputError for a frame or box of no use, or a crop that is flat.
+    """
+    own, size = detector.info.margin, detector.info.size
+    window = centre_crop(box, margin or own, size)
+    if crop_image(frame, window).std() < FLAT:
+        raise InputError("nothing to see: the crop is flat")
+    look = detector.look(frame, window)
+    for _ in range(LOOKS - 1):
+        if _frames(look, own):
+            break
+        wider = own if look.visible[:4].min() >= PRESENT else WIDE_MARGIN
+        look = detector.look(frame, centre_crop(box_around(look.keypoints.mean_px[:4]), wider, size))
+    if look.present < PRESENT:
+        return Sight(look, look.keypoints, f"no runway in view (its probability is {look.present:.2g})")
+    if not _frames(look, own):
+        return Sight(look, look.keypoints, f"the runway does not settle inside the crop in {LOOKS} looks")
+    keypoints, end_crops = _sharpened(detector, frame, look)
+    return Sight(look, keypoints, _cut_off(keypoints, frame.shape[1], frame.shape[0]), end_crops)
+
+
+def _sharpened(
+    detector: KeypointDetector, frame: Image, look: Look
+) -> tuple[GaussianKeypoints, tuple[PixelWindow, ...]]:
+    """The keypoints with each end from a look of its own, where that shows it larger; and those looks' windows.
+
+    The crop that holds the whole of a near runway shows its far end, on which the monitor's power
+    rests, a few pixels wide. What two looks say of two ends is taken as independent.
+    """
+    known = look.keypoints
+    if look.window.scale[0] >= MAGNIFIED:
+        return known, ()
+    windows = {end: _around_end(known, end, detector.info.size) for end in range(len(ENDS))}
+    windows = {end: w for end, w in windows.items() if w.scale[0] > SHARPER * look.window.scale[0]}
+    if not windows:
+        return known, ()
+    mean, cov = known.mean_px.copy(), known.cov_px.copy()
+    for end, again in zip(windows, detector.look_all(frame, list(windows.values())), strict=True):
+        corners, rows = ENDS[end], slice(2 * ENDS[end].start, 2 * ENDS[end].stop)
+        if again.visible[corners].min() < PRESENT or not _holds(again.window, again.keypoints.mean_px[corners]):
+            continue  # the first look stands
+        mean[corners] = again.keypoints.mean_px[corners]
+        cov[rows], cov[:, rows] = 0.0, 0.0
+        cov[rows, rows] = again.keypoints.cov_px[rows, rows]
+    return GaussianKeypoints(mean, cov), tuple(windows.values())
+
+
+def _cut_off(keypoints: GaussianKeypoints, width: int, height: int) -> str:
+    """Which corner is at the frame's border, to within 2 sigma: it may lie beyond, unseen."""
+    reach = 2 * keypoints.sigma_px
+    last = np.array([width - 1, height - 1])
+    outside = ((keypoints.mean_px < reach) | (keypoints.mean_px > last - reach))[:4].any(axis=1)
+    if not outside.any():
+        return ""
+    return f"the {CORNER_NAMES[int(outside.argmax())]} corner lies at the border of the frame, or beyond it"
 
 
 def _around_end(known: GaussianKeypoints, end: int, size: int) -> PixelWindow:

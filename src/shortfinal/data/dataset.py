@@ -7,7 +7,6 @@ continues where it stopped.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -26,7 +25,7 @@ from shortfinal.data.image import Image, read_image
 from shortfinal.data.labelled import Label, Picture
 from shortfinal.data.lard import AIMING_POINT_M, NAUTICAL_MILE_M, NewLabel, write_database, write_labels
 from shortfinal.errors import InputError
-from shortfinal.files import csv_text, make_folder, write_png, write_whole
+from shortfinal.files import claim, csv_text, make_folder, write_png, write_whole
 from shortfinal.geometry import Camera, PixelWindow, Pose, can_project, project, unproject
 from shortfinal.keypoints import AIMING_NAMES, CORNER_NAMES
 from shortfinal.runway import Runway
@@ -246,7 +245,7 @@ def write_dataset(
     made_by: dict[str, Any] = {"seed": seed, "camera": None if camera is None else asdict(camera)}
     if crop_px is not None:
         made_by["crop_px"] = crop_px
-    _claim(folder / "dataset.json", made_by)
+    claim(folder / "dataset.json", made_by, "a data set of another seed, camera or crop")
 
     def one(index: int) -> tuple[dict[str, str], NewLabel, Runway]:
         name = f"images/{index:06d}.png"
@@ -265,22 +264,6 @@ def write_dataset(
         write_database(folder / "runways.json", runways)
     write_whole(folder / "labels.csv", csv_text(COLUMNS, rows))
     return folder / "labels.csv"
-
-
-def _claim(stamp: Path, made_by: dict[str, Any]) -> None:
-    """Note in the folder what its pictures follow from, or refuse a folder of other pictures."""
-    text = json.dumps(made_by)
-    try:
-        there = stamp.read_text(encoding="utf-8") if stamp.exists() else text
-    except OSError as error:
-        raise InputError(f"{stamp}: cannot be read: {error.strerror}; choose an empty folder") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{stamp}: not a text file; choose an empty folder") from error
-    if there != text:
-        raise InputError(
-            f"{stamp.parent}: holds a data set of another seed, camera or crop; choose an empty folder or the same ones"
-        )
-    write_whole(stamp, text)
 
 
 def _is_whole_png(path: Path) -> bool:

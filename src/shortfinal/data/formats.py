@@ -215,7 +215,8 @@ def _read_own(file: Path, camera: Camera | None) -> tuple[list[_TableRow], list[
         raise InputError(f"{file}: line 1: no column {', '.join(missing)}")
     if not table.records:
         raise InputError(f"{file}: line 1: a header without rows; expected one label per line")
-    rows, bad = table.read(lambda row: _own_row(row, camera))
+    cameras: dict[tuple[str, ...], Camera | None] = {}  # by their cells: most rows have the same
+    rows, bad = table.read(lambda row: _own_row(row, camera, cameras))
     return rows, _problems(bad, file)
 
 
@@ -223,8 +224,11 @@ def _problems(refusals: Iterable[Refusal], file: Path) -> list[Problem]:
     return [refused(InputError(r.message), file, f"line {r.line}") for r in refusals]
 
 
-def _own_row(row: Row, given: Camera | None) -> _TableRow:
-    camera = given or _own_camera(row)
+def _own_row(row: Row, given: Camera | None, cameras: dict[tuple[str, ...], Camera | None]) -> _TableRow:
+    cells = tuple(row.get(name) for name in (*CAMERA_COLUMNS, "distortion"))
+    if given is None and cells not in cameras:
+        cameras[cells] = _own_camera(row)
+    camera = given or cameras[cells]
     size = (camera.width, camera.height) if camera else None
     image = row.text("image")
     split = _split_of(row.get("split"), image, Path(row.path))

@@ -11,6 +11,7 @@ where one becomes the other.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -194,8 +195,9 @@ def split_named(*names: str) -> str:
 
 def find_image(name: str, folders: Iterable[Path]) -> Path:
     """The image of that name, or of its last part, in the first folder that has it; else where it should be."""
-    candidates = [folder / part for folder in folders for part in dict.fromkeys((name, Path(name).name))]
-    return next((path for path in candidates if path.is_file()), candidates[0])
+    parts = dict.fromkeys((name, os.path.basename(name)))
+    candidates = [os.path.join(folder, part) for folder in folders for part in parts]
+    return Path(next((path for path in candidates if os.path.isfile(path)), candidates[0]))
 
 
 def read_text(path: Path, what: str) -> str:

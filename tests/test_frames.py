@@ -3,7 +3,7 @@ import pytest
 from test_pose import CAMERA, RUNWAY, on_approach
 
 import shortfinal as sf
-from shortfinal.evaluate import corner_figures, evaluate
+from shortfinal.evaluate.frames import corner_figures, evaluate
 from shortfinal.pipeline import FrameResult
 
 

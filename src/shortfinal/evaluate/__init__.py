@@ -1,0 +1,1 @@
+"""Predictions and truth in; the figures of the field, with their intervals, out."""
