@@ -64,9 +64,7 @@ def made_up(folder, count, seed=0):
     import importlib.util
     from pathlib import Path
 
-    spec = importlib.util.spec_from_file_location(
-        "made_up", Path(__file__).parents[1] / "benchmarks" / "evaluation.py"
-    )
+    spec = importlib.util.spec_from_file_location("made_up", Path(__file__).parents[1] / "benchmarks" / "evaluation.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.make(folder, count, seed)
@@ -140,6 +138,7 @@ def test_figures_of_known_errors(tmp_path):
     assert set(METRICS) - set(figures) == {  # there are no pictures, and no network
         *(f"error_input_px.{q}" for q in ("mean", "median", "q90", "q99")), "sigma_input_px.median",
         *(f"latency_ms.{q}" for q in ("median", "q95", "q99")),
+        "presence.auroc", "presence.refused", "presence.false_find",
     }  # fmt: skip
     # 24,000 coordinates: 3.3 standard errors of a share are 1.07 points at most; those of 3,000 rows 1.8.
     for level in (50, 68, 90, 95, 99):

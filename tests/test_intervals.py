@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from shortfinal.evaluate.intervals import mean_figure, quantile_figures, share_figure
+from shortfinal.evaluate.intervals import auroc_figure, mean_figure, quantile_figures, share_figure
 
 TRIALS, ROWS = 2000, 60
 
@@ -59,6 +59,24 @@ def test_none_of_many_is_not_none_at_all():
     never = share_figure(np.zeros(1000))
     assert (never.value, never.low) == (0.0, 0.0)
     assert never.high == pytest.approx(0.00368, abs=1e-4)  # 1 - 0.025 ** (1 / 1000)
+
+
+def test_the_area_under_the_roc_is_the_share_of_pairs_in_order_and_held_by_its_interval():
+    rng = np.random.default_rng(2)
+    a, b = np.round(rng.normal(1, 1, 40), 1), np.round(rng.normal(0, 1, 30), 1)
+    pairs = np.mean([(x > y) + 0.5 * (x == y) for x in a for y in b])
+    assert auroc_figure(a, b).value == pytest.approx(pairs)
+    true, inside = 0.9213503965, 0  # Φ(2 / √2)
+    for _ in range(TRIALS):
+        figure = auroc_figure(rng.normal(2, 1, 60), rng.normal(0, 1, 50))
+        inside += figure.low <= true <= figure.high
+    assert inside / TRIALS == pytest.approx(0.95, abs=0.02)
+
+
+def test_a_perfect_separation_is_not_certain():
+    figure = auroc_figure(np.linspace(1, 2, 20), np.linspace(-1, 0, 30))
+    assert figure.value == figure.high == 1
+    assert figure.low == pytest.approx(0.025 ** (1 / 20), abs=1e-6)
 
 
 def test_of_nothing_nothing_is_said_and_of_one_row_no_interval():

@@ -330,13 +330,34 @@ def evaluate(
             evidence["requirements"] = check(wanted, made.rows, lambda rows: figures_of(rows, limits))
         write_report(made, out, Subject(subject), data, requirements, seen)
     if as_json:
-        _print_json({name: evidence[name] for name in ("counts", "metrics", "requirements", "notes")} | {"out": str(out)})
+        _print_json(
+            {name: evidence[name] for name in ("counts", "metrics", "requirements", "notes")} | {"out": str(out)}
+        )
     else:
         _print_figures(evidence, out)
     if wanted and not passed(evidence["requirements"]):
         lacking = [f"{one['id']} {one['result']}" for one in evidence["requirements"] if one["result"] != "shown"]
         raise JobError(f"{requirements}: {len(lacking)} of {len(wanted.requirements)} not met ({', '.join(lacking)}); "
                        f"see {out}/report.html")  # fmt: skip
+
+
+@app.command()
+def verify(
+    report: Annotated[Path, typer.Argument(help="Folder that evaluate wrote, or its manifest.json.")],
+    subject: Annotated[Path | None, typer.Option(help="The model or predictions, to be compared too.")] = None,
+    data: Annotated[Path | None, typer.Option(help="The data set, to be compared too.")] = None,
+    requirements: Annotated[Path | None, typer.Option(help="The requirements, to be compared too.")] = None,
+) -> None:
+    """Is a report still what evaluate wrote, of the same model, data and requirements? Exit status 1 if not."""
+    from shortfinal.evaluate.pack import verify_manifest
+
+    manifest = report / "manifest.json" if report.is_dir() else report
+    changed = verify_manifest(manifest, subject=subject, data=data, requirements=requirements)
+    for line in changed:
+        console.print(Text(line))
+    if changed:
+        raise JobError(f"{manifest}: {len(changed)} things no longer match")
+    console.print(f"{manifest}: everything matches")
 
 
 @reproduce_app.command("table1")

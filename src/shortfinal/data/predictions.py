@@ -31,8 +31,9 @@ from shortfinal.files import read_json
 Array = NDArray[np.float64]
 
 SIGMA_COLUMNS = tuple(f"{name[:-1]}sigma_{name[-1]}" for name in CORNER_COLUMNS)
+_NUMBERS = ("score", "absent", "enlarged", "grey", "latency_ms")  # each may be missing
 COLUMNS = (
-    "image", "label", "ident", *CORNER_COLUMNS, "cov", "score", "enlarged", "grey", "latency_ms", "obstacle",
+    "image", "label", "ident", *CORNER_COLUMNS, "cov", *_NUMBERS, "obstacle",
 )  # fmt: skip
 _UPPER = np.triu_indices(8)
 _SMALLEST_PX = 1e-6  # a sigma below it is a mistake
@@ -49,6 +50,7 @@ class Prediction:
     ident: str = ""  # "LFPO/24"; "": not said
     label: str = ""  # "labels.csv: line 7": the label it was made for; "": not said
     score: float = math.nan  # of the detector, or the probability of a runway
+    absent: float = math.nan  # the same of a part of the picture without the runway
     enlarged: float = math.nan  # pixels of the network's input for one of the picture's
     grey: float = math.nan  # mean level of what was looked at, 0 to 255
     latency_ms: float = math.nan
@@ -102,9 +104,7 @@ def _table_row(row: Row, has_sigma: bool) -> Prediction:
         elif has_sigma:
             sigma = [row.number(name, _SMALLEST_PX, LARGEST_PX) for name in SIGMA_COLUMNS]
             cov = np.diag(np.square(sigma))
-    extra = {
-        name: row.number(name) if row.get(name) else math.nan for name in ("score", "enlarged", "grey", "latency_ms")
-    }
+    extra = {name: row.number(name) if row.get(name) else math.nan for name in _NUMBERS}
     where = f"{row.path}: line {row.line}"
     ident = (row.get("ident") or row.get("runway")).upper()
     return Prediction(where, row.text("image"), mean, cov, ident, row.get("label"), obstacle=obstacle, **extra)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -10,8 +12,9 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from shortfinal.calibration import LEVELS
-from shortfinal.evaluate.intervals import mean_figure, quantile_figures, share_figure
+from shortfinal.evaluate.intervals import auroc_figure, mean_figure, quantile_figures, share_figure
 from shortfinal.evaluate.rows import AXES, DECISIONS, MISSING, NOT_MONITORED, Figure, Rows
+from shortfinal.pipeline import PRESENT
 from shortfinal.protection import AlertLimits
 
 Array = NDArray[np.float64]
@@ -28,13 +31,47 @@ LIGHTS = ("night", "dim", "bright")
 MOST_AIRPORTS = 60  # in tables and pictures: those with most rows
 
 
+# What figures are called, by what they are made of.
+CORNERS = (
+    *(f"{part}error_px.{q}" for part in PARTS for q in ("mean", *_PIXELS)),
+    *(f"error_input_px.{q}" for q in ("mean", *_PIXELS)), "sigma_px.median", "sigma_input_px.median", "nll", "nees",
+    *(f"{part}coverage.{level * 100:.0f}" for part in PARTS for level in LEVELS),
+)  # fmt: skip
+DECIDED = tuple(decision.replace("-", "_") for decision in DECISIONS)
+TESTED = ("alarm", "detection.far_threshold_184m")
+WITHIN = tuple(f"{axis}_within_2sigma" for axis in AXES)
+OVER = (*(f"{axis}_over_level" for axis in AXES), "over_level")
+OF_LIMITS = ("available", "hazardous")  # which need alert limits
+POSES = (
+    *(f"{axis}_m.{q}" for axis in AXES for q in ("median", "q90", "q95")), "distance_relative.median",
+    "distance_relative.q90", *WITHIN, *OVER, "hazardous",
+)  # fmt: skip
+BOUNDS = tuple(f"level.{axis}_m.median" for axis in AXES)
+SCOPE = ("presence.auroc", "presence.refused", "presence.false_find")
+LATENCY = tuple(f"latency_ms.{q}" for q in ("median", "q95", "q99"))
+METRICS = (*CORNERS, *DECIDED, *TESTED, *POSES, "available", *BOUNDS, *SCOPE, *LATENCY)
+_SHARES = {*DECIDED, *TESTED, *WITHIN, *OVER, *OF_LIMITS, *SCOPE, *(name for name in CORNERS if "coverage" in name)}
+
+
+def is_share(metric: str) -> bool:
+    """Whether a figure lies between 0 and 1."""
+    return metric in _SHARES
+
+
 def figures_of(rows: Rows, limits: AlertLimits | None = None) -> dict[str, Figure]:
     """Every figure that these rows allow, by name (docs/evaluation.md); what nothing is known of is absent.
 
     `limits`: alert limits, for availability and hazardous information.
     """
     found: dict[str, Figure] = {}
-    for name, figure in (*_shares(rows), *_pixels(rows), *_honesty(rows), *_navigation(rows, limits), *_times(rows)):
+    for name, figure in (
+        *_shares(rows),
+        *_pixels(rows),
+        *_honesty(rows),
+        *_navigation(rows, limits),
+        *_scope(rows),
+        *_times(rows),
+    ):
         if figure is not None:
             found[name] = figure
     return found
@@ -46,7 +83,7 @@ def groups_of(rows: Rows) -> Iterator[tuple[str, str, Flags]]:
     for by, values, edges, unit in (
         ("distance", rows.distance_m, DISTANCE_M, "m"), ("glide", rows.glide_deg, GLIDE_DEG, "°")
     ):  # fmt: skip
-        for low, high in zip(edges, edges[1:], strict=False):
+        for low, high in itertools.pairwise(edges):
             yield by, f"{low:g}–{high:g} {unit}", (values >= low) & (values < high)
     for name in airports_of(rows):
         yield "airport", name, rows.airport == name
@@ -65,7 +102,7 @@ def airports_of(rows: Rows) -> dict[str, int]:
 def metrics_of(rows: Rows, limits: AlertLimits | None = None) -> list[dict[str, Any]]:
     """`figures_of` all rows and of every group that has any, as records."""
     return [
-        {"by": by, "group": group, "name": name, **figure._asdict()}
+        {"by": by, "group": group, "name": name, **asdict(figure)}
         for by, group, which in groups_of(rows)
         if which.any()
         for name, figure in figures_of(rows.select(which), limits).items()
@@ -159,6 +196,13 @@ def _limits(limits: AlertLimits) -> Array:
     return np.array([limits.along_m, limits.cross_m, limits.vertical_m])
 
 
+def _scope(rows: Rows) -> Named:
+    """In scope or not: crops with the runway against crops beside it."""
+    yield "presence.auroc", auroc_figure(rows.present, rows.absent)
+    yield "presence.refused", share_figure(_flags(rows.present < PRESENT, rows.present))
+    yield "presence.false_find", share_figure(_flags(rows.absent >= PRESENT, rows.absent))
+
+
 def _times(rows: Rows) -> Named:
     yield from _quantiles("latency_ms", rows.latency_ms, ("median", "q95", "q99"), "ms")
 
@@ -166,15 +210,3 @@ def _times(rows: Rows) -> Named:
 def _flags(flags: Flags, of: Array) -> Array:
     """1 or 0, NaN where what was compared is not known."""
     return np.where(np.isnan(of), np.nan, flags)
-
-
-METRICS = (
-    *(d.replace("-", "_") for d in DECISIONS), "alarm",
-    *(f"{part}error_px.{q}" for part in PARTS for q in ("mean", *_PIXELS)),
-    *(f"error_input_px.{q}" for q in ("mean", *_PIXELS)), "sigma_px.median", "sigma_input_px.median", "nll", "nees",
-    *(f"{part}coverage.{level * 100:.0f}" for part in PARTS for level in LEVELS),
-    *(f"{a}_m.{q}" for a in AXES for q in ("median", "q90", "q95")), *(f"{a}_within_2sigma" for a in AXES),
-    *(f"{a}_over_level" for a in AXES), *(f"level.{a}_m.median" for a in AXES), "over_level",
-    "distance_relative.median", "distance_relative.q90", "detection.far_threshold_184m", "available", "hazardous",
-    *(f"latency_ms.{q}" for q in ("median", "q95", "q99")),
-)  # fmt: skip

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaincinv, stdtrit
+from scipy.special import betaincinv, expit, logit, ndtri, stdtrit
 
 from shortfinal.evaluate.rows import Figure
 
@@ -67,6 +67,35 @@ def quantile_figures(values: Array, levels: Sequence[float], unit: str = "") -> 
         low, high = (float(end) for end in np.quantile(known, ends))
         figures.append(Figure(at, low, high, len(known), unit))
     return figures
+
+
+def auroc_figure(inside: Array, outside: Array) -> Figure | None:
+    """The area under the ROC curve of a score that should be high inside (N,) and low outside (M,); NaN left out.
+
+    It is the share of pairs in the right order, ties counted half. The interval is DeLong, DeLong and
+    Clarke-Pearson's (1988), on the scale of the logit, where it cannot leave (0, 1); of a perfect separation, as
+    for so many rows without an exception. None where either is empty.
+    """
+    a, b = inside[~np.isnan(inside)], outside[~np.isnan(outside)]
+    if not (len(a) and len(b)):
+        return None
+    above = (_below(a, b), 1 - _below(b, a))  # of each its share of pairs in the right order
+    area, pairs = float(above[0].mean()), len(a) + len(b)
+    if min(len(a), len(b)) < 2:
+        return Figure(area, math.nan, math.nan, pairs, "")
+    variance = float(sum(np.var(shares, ddof=1) / len(shares) for shares in above))
+    if variance == 0:
+        return Figure(area, *_share_interval(area, min(len(a), len(b))), pairs, "")
+    reach = float(ndtri(1 - _TAIL)) * math.sqrt(variance) / (area * (1 - area))
+    low, high = expit(logit(area) + np.array([-reach, reach]))
+    return Figure(area, float(low), float(high), pairs, "")
+
+
+def _below(values: Array, others: Array) -> Array:
+    """Of each value the share of the others that it exceeds, ties counted half."""
+    ordered = np.sort(others)
+    less, up_to = (np.searchsorted(ordered, values, side=side) for side in ("left", "right"))
+    return np.asarray((less + up_to) / 2 / len(others))
 
 
 def _by_row(values: Array) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,9 @@ class Rates:
     fault_prior: float = FAULT_PRIOR
 
 
+NOMINAL = Rates()
+
+
 class Solved(NamedTuple):
     """N answers; NaN where there is none."""
 
@@ -45,7 +48,10 @@ class Solved(NamedTuple):
 
     def select(self, which: Places) -> Solved:
         """Some of them."""
-        return Solved(*(part[which] for part in self[:8]), *self[8:])
+        some: dict[str, Any] = {
+            name: value[which] for name, value in self._asdict().items() if isinstance(value, np.ndarray)
+        }
+        return self._replace(**some)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +71,7 @@ class Problems:
     @classmethod
     def of(cls, mean_px: Array, cov_px: Array, points: Array, cameras: list[Camera | None]) -> Problems:
         """`points` (N, 4, 3) and `mean_px` (N, 4, 2) NaN where not known."""
-        known = np.isfinite(points).all(axis=(1, 2)) & np.isfinite(mean_px).all(axis=(1, 2))
+        known: Flags = np.asarray(np.isfinite(points).all(axis=(1, 2)) & np.isfinite(mean_px).all(axis=(1, 2)))
         mean, cov, scale = mean_px.copy(), cov_px.copy(), np.ones((len(mean_px), 2))
         groups: dict[Camera | None, list[int]] = {}
         for i, camera in enumerate(cameras):

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from shortfinal.crops import box_around
+from shortfinal.crops import box_around, inverse_crop
 from shortfinal.data.formats import CORNER_COLUMNS
 from shortfinal.data.image import Image, read_image
 from shortfinal.data.predictions import COLUMNS, Predictions, Target, read_predictions, triangle_text
@@ -49,7 +50,7 @@ def predict(
                 if (target.picture.name, target.source) not in done:
                     if open_path != target.picture.path:
                         image, open_path = _opened(target), target.picture.path
-                    file.write(_line(_record(detector, target, image)))
+                    file.write(_line(_record(detector, target, image, number)))
                     file.flush()
                 if progress:
                     progress(number, len(targets))
@@ -81,8 +82,8 @@ def _opened(target: Target) -> Image | None:
         return None  # said in the line, and among the problems of the data set where the file is missing
 
 
-def _record(detector: KeypointDetector, target: Target, image: Image | None) -> list[str]:
-    """A line's cells."""
+def _record(detector: KeypointDetector, target: Target, image: Image | None, number: int) -> list[str]:
+    """A line's cells; `number` seeds the draw of a crop without the runway."""
     start = time.perf_counter()
     sight, obstacle = _seen(detector, target, image)
     elapsed_ms = 1e3 * (time.perf_counter() - start)
@@ -97,20 +98,27 @@ def _record(detector: KeypointDetector, target: Target, image: Image | None) -> 
         cells["enlarged"] = f"{float(sight.look.window.scale[0]):.6g}"
         cells["grey"] = f"{crop_image(image, sight.look.window).mean():.4g}"
         cells["latency_ms"] = f"{elapsed_ms:.4g}"
+        beside = inverse_crop(_box(target), image.shape[1::-1], detector.info.size, np.random.default_rng(number))
+        if beside is not None:
+            cells["absent"] = f"{detector.look(image, beside).present:.6g}"
     return [str(cells.get(name, "")) for name in COLUMNS]
 
 
 def _seen(detector: KeypointDetector, target: Target, image: Image | None) -> tuple[Sight | None, str]:
     if image is None:
         return None, "the picture cannot be read"
-    corners = target.truth_px[np.isfinite(target.truth_px).all(axis=1)]
-    if len(corners) < 2:
+    if np.isfinite(target.truth_px).all(axis=1).sum() < 2:
         return None, "less than two corners are in the picture"
     try:
-        sight = see(detector, image, box_around(corners))
+        sight = see(detector, image, _box(target))
     except InputError as error:
         return None, str(error)
     return sight, sight.obstacle
+
+
+def _box(target: Target) -> NDArray[np.float64]:
+    """Around those corners that the picture shows."""
+    return box_around(target.truth_px[np.isfinite(target.truth_px).all(axis=1)])
 
 
 def _line(cells: Sequence[str]) -> str:

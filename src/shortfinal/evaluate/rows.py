@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,8 @@ DECISIONS = (USE, DO_NOT_USE, NOT_MONITORED, MISSING)  # missing: nothing was pr
 AXES = ("along", "cross", "vertical")
 
 
-class Figure(NamedTuple):
+@dataclass(frozen=True)
+class Figure:
     """One number that was measured, and the interval that holds the true one with 95 %."""
 
     value: float
@@ -46,6 +46,7 @@ class Rows:
     decision: Texts  # (N,) one of DECISIONS
     reason: Texts  # (N,) in words
     present: Array  # (N,) probability that a runway is in view
+    absent: Array  # (N,) the same of a crop beside the runway, of its scale, without it
     statistic: Array  # (N,) of the integrity test; of those monitored
     dof: Array  # (N,)
     p_value: Array  # (N,)

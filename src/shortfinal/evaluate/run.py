@@ -25,7 +25,7 @@ from shortfinal.errors import InputError
 from shortfinal.evaluate.faults import MOST_ROWS, PAPER_M, fault_figures
 from shortfinal.evaluate.figures import DISTANCE_M, airports_of, metrics_of
 from shortfinal.evaluate.intervals import share_figure
-from shortfinal.evaluate.judge import Problems, Rates, Solved, reasons_of
+from shortfinal.evaluate.judge import NOMINAL, Problems, Rates, Solved, reasons_of
 from shortfinal.evaluate.predict import predict
 from shortfinal.evaluate.rows import AXES, DO_NOT_USE, MISSING, NOT_MONITORED, USE, Rows
 from shortfinal.evaluate.truth import Known, Truth, read_truth
@@ -72,7 +72,7 @@ def evaluate(
     camera: Camera | None = None,
     corners: Sequence[str] = (),
     origin: Origin = "corner",
-    rates: Rates = Rates(),
+    rates: Rates = NOMINAL,
     limits: AlertLimits | None = None,
     seed: int = 0,
     progress: Seen = lambda what, done, total: None,
@@ -216,7 +216,8 @@ def _judged(
         ident=_texts(k.target.label.ident for k in known), airport=_texts(k.target.label.airport for k in known),
         light=_texts(_light(p) for p in predictions), truth_px=truth_px, mean_px=mean, cov_px=cov,
         enlarged=_numbers(predictions, "enlarged"), distance_m=far, glide_deg=glide, lateral_deg=lateral,
-        decision=decision, reason=reason, present=_numbers(predictions, "score"), statistic=solved.statistic,
+        decision=decision, reason=reason, present=_numbers(predictions, "score"),
+        absent=_numbers(predictions, "absent"), statistic=solved.statistic,
         dof=np.full(n, solved.dof), p_value=solved.p_value, error_m=solved.position_m - position,
         sigma_m=solved.sigma_m, level_m=solved.level_m,
         caught_184m=np.where(solved.monitored, ~short.usable, np.nan), latency_ms=_numbers(predictions, "latency_ms"),
@@ -239,7 +240,7 @@ def _light(prediction: Prediction | None) -> str:
 
 
 def _geometry(position: Array, known: Sequence[Known]) -> tuple[Array, Array, Array]:
-    """Distance, glide angle and lateral angle (N,) of true positions (N, 3); of a distance that is recorded alone, it."""
+    """Distance, glide angle and lateral angle (N,) of true positions (N, 3); else the recorded distance."""
     x, y, z = position.T
     recorded = [k.target.label.recorded for k in known]
     distance = np.array([math.nan if r is None or r.distance_m is None else r.distance_m for r in recorded])
@@ -270,7 +271,8 @@ def _evidence(
             "alert_limits_m": limits and [limits.along_m, limits.cross_m, limits.vertical_m],
         },
         "counts": {
-            "labels": len(rows), "predicted": int(rows.predicted.sum()), "missing": int((rows.decision == MISSING).sum()),
+            "labels": len(rows), "predicted": int(rows.predicted.sum()),
+            "missing": int((rows.decision == MISSING).sum()),
             "decisions": {str(k): int(v) for k, v in Counter(rows.decision.tolist()).items()},
         },
         "problems": [],
@@ -314,7 +316,7 @@ def _sharpness(rows: Rows) -> dict[str, list[Any]] | None:
 
     def counted(part: Array) -> list[int]:
         known = part[np.isfinite(part)].clip(_SIGMA_EDGES_PX[0], _SIGMA_EDGES_PX[-1])
-        return np.histogram(known, _SIGMA_EDGES_PX)[0].tolist()
+        return [int(count) for count in np.histogram(known, _SIGMA_EDGES_PX)[0]]
 
     return {
         "edges": _SIGMA_EDGES_PX.tolist(), "counts": counted(sigma), "near": counted(sigma[:, :2]),
@@ -347,7 +349,7 @@ def _navigation(rows: Rows) -> dict[str, Any] | None:
 
 def _stanford(rows: Rows, limits: AlertLimits | None) -> dict[str, dict[str, int]] | None:
     """Rows with a true position and a level, by region of the Stanford diagram (Tossaint et al. 2007), per axis."""
-    known = np.isfinite(rows.error_m).all(axis=1) & ~np.isnan(rows.level_m).any(axis=1)
+    known = np.asarray(np.isfinite(rows.error_m).all(axis=1) & ~np.isnan(rows.level_m).any(axis=1))
     if not known.any():
         return None
     bounds = (math.inf,) * 3 if limits is None else (limits.along_m, limits.cross_m, limits.vertical_m)

@@ -15,8 +15,8 @@ from shortfinal.keypoints import CORNER_NAMES
 _PLACES = [f"{name.replace('-', '_')}_{axis}" for name in CORNER_NAMES for axis in "uv"]
 _TEXTS = ("picture", "source", "ident", "airport", "light", "decision", "reason")
 _NUMBERS = (
-    "distance_m", "glide_deg", "lateral_deg", "enlarged", "present", "statistic", "dof", "p_value", "caught_184m",
-    "latency_ms",
+    "distance_m", "glide_deg", "lateral_deg", "enlarged", "present", "absent", "statistic", "dof", "p_value",
+    "caught_184m", "latency_ms",
 )  # fmt: skip
 
 
