@@ -18,6 +18,7 @@ from PIL import ImageDraw, ImageFont
 from shortfinal.detector import crop_image
 from shortfinal.geometry import PixelWindow
 from shortfinal.integrity import Decision
+from shortfinal.keypoints import GaussianKeypoints
 from shortfinal.pipeline import FrameResult
 
 Array = NDArray[np.float64]
@@ -37,7 +38,9 @@ _INK: Colour = (232, 236, 242)
 _DIM: Colour = (142, 152, 166)
 _AMBER: Colour = (255, 196, 84)
 _ELLIPSE: Colour = (255, 236, 110)
+_TRUTH: Colour = (255, 80, 255)
 _SHIFT = 4  # OpenCV draws at 1/16 px
+_FARTHEST = 10**6  # of a coordinate that it is given
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ def draw_result(frame: Image, result: FrameResult, notes: Notes) -> Image:
     size = (round(width * scale), round(height * scale))
     whole = PixelWindow.resize(width, height, *size)
     view = crop_image(frame, whole)
-    draw_keypoints(view, result, whole)
+    draw_keypoints(view, result.keypoints, whole, COLOURS[result.verdict.decision])
     canvas = np.full((_VIEW[1], _VIEW[0] + _PANEL + _GAP, 3), _PAPER, np.uint8)
     top, left = (_VIEW[1] - size[1]) // 2, (_VIEW[0] - size[0]) // 2
     canvas[top : top + size[1], left : left + size[0]] = view
@@ -65,14 +68,28 @@ def draw_result(frame: Image, result: FrameResult, notes: Notes) -> Image:
     return _draw_text(canvas, result, notes)
 
 
-def draw_keypoints(view: Image, result: FrameResult, window: PixelWindow) -> None:
-    """Outline and 2-sigma ellipses, drawn in place into a view of the frame through `window`."""
-    if result.keypoints is None:
+def draw_keypoints(
+    view: Image, keypoints: GaussianKeypoints | None, window: PixelWindow, colour: Colour | None
+) -> None:
+    """Outline, if it has a colour, and 2-sigma ellipses, drawn in place into a view of the frame through `window`."""
+    if keypoints is None:
         return
-    means = window.apply(result.keypoints.mean_px)
-    _draw_outline(view, means, COLOURS[result.verdict.decision])
-    for k, mean in enumerate(means):
-        _draw_outline(view, ellipse(mean, window.apply_cov(result.keypoints.block(k)), 2.0), _ELLIPSE)
+    if colour is not None:
+        draw_outline(view, keypoints.mean_px, window, colour)
+    for k, mean in enumerate(keypoints.mean_px):
+        draw_outline(view, ellipse(mean, keypoints.block(k), 2.0), window, _ELLIPSE)
+
+
+def draw_outline(view: Image, px: ArrayLike, window: PixelWindow, colour: Colour) -> None:
+    """A closed line through points (n, 2) of the frame, drawn in place into a view of it through `window`."""
+    fixed = np.clip(np.round(window.apply(px) * 2**_SHIFT), -_FARTHEST, _FARTHEST).astype(np.int32)
+    cv2.polylines(view, [fixed.reshape(-1, 1, 2)], True, colour, 1, cv2.LINE_AA, _SHIFT)
+
+
+def draw_truth(view: Image, truth_px: ArrayLike, window: PixelWindow) -> None:
+    """Labelled corners (n, 2) of the frame as crosses, drawn in place into a view of it through `window`."""
+    for u, v in np.clip(np.round(window.apply(truth_px)), -_FARTHEST, _FARTHEST).astype(int).tolist():
+        cv2.drawMarker(view, (u, v), _TRUTH, cv2.MARKER_TILTED_CROSS, 9, 1, cv2.LINE_AA)
 
 
 def ellipse(mean: ArrayLike, cov: ArrayLike, sigmas: float, points: int = 48) -> Array:
@@ -92,10 +109,14 @@ def draw_close_up(
     tile = np.full((size, size, 3), _PAPER, np.uint8)
     if result.crop is not None:
         tile, window = _seen(frame, result, result.crop, size)
-        for u, v in [] if truth_px is None else window.apply(truth_px):
-            centre = (round(u), round(v))
-            cv2.drawMarker(tile, centre, (255, 80, 255), cv2.MARKER_TILTED_CROSS, 9, 1, cv2.LINE_AA)
-    cv2.rectangle(tile, (0, 0), (size - 1, size - 1), COLOURS[result.verdict.decision], 3)
+        if truth_px is not None:
+            draw_truth(tile, truth_px, window)
+    return framed(tile, title, COLOURS[result.verdict.decision])
+
+
+def framed(tile: Image, title: str, colour: Colour) -> Image:
+    """The tile (h, w, 3) with a frame and a line of text."""
+    cv2.rectangle(tile, (0, 0), (tile.shape[1] - 1, tile.shape[0] - 1), colour, 3)
     return write_labelled(tile, title)
 
 
@@ -117,16 +138,11 @@ def write_labelled(picture: Image, text: str, colour: Colour = _INK, size: int =
     return np.asarray(image, np.uint8)
 
 
-def _draw_outline(view: Image, points: Array, colour: Colour) -> None:
-    fixed = np.round(points * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)
-    cv2.polylines(view, [fixed], True, colour, 1, cv2.LINE_AA, _SHIFT)
-
-
 def _seen(frame: Image, result: FrameResult, crop: PixelWindow, size: int) -> tuple[Image, PixelWindow]:
     """The crop magnified, with the keypoints drawn, and its window."""
     window = PixelWindow(crop.left, crop.top, crop.width, crop.height, size, size)
     view = crop_image(frame, window)
-    draw_keypoints(view, result, window)
+    draw_keypoints(view, result.keypoints, window, COLOURS[result.verdict.decision])
     return view, window
 
 
