@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import shutil
 
 import numpy as np
@@ -15,6 +16,7 @@ from shortfinal.detector import shipped_model
 from shortfinal.errors import InputError
 from shortfinal.evaluate.figures import METRICS, figures_of, metrics_of
 from shortfinal.evaluate.judge import Rates
+from shortfinal.evaluate.requirements import Condition, Requirement, Requirements, check
 from shortfinal.evaluate.run import FITTED, Subject, evaluate
 from shortfinal.protection import AlertLimits
 
@@ -228,6 +230,18 @@ def test_a_data_set_without_camera_or_runway_is_judged_in_pixels_and_that_is_sai
     assert made.evidence["statistic"] is None
 
 
+_HONEST = [
+    Requirement(f"sigma at AP{k:02d}", "near_coverage.95", at_least=0.9, where=Condition(airport=(f"AP{k:02d}",)))
+    for k in range(20)
+]
+_BEYOND, _NEARER = Condition(distance_m=(2000.0, math.inf)), Condition(distance_m=(0.0, 2000.0))
+_SHARP = [
+    Requirement("far corners beyond 2 km", "far_error_px.median", at_most=0.6, where=_BEYOND),
+    Requirement("far corners nearer", "far_error_px.median", at_most=0.6, where=_NEARER),
+]
+_REQUIRED = Requirements(None, (*_HONEST, *_SHARP))
+
+
 @pytest.mark.parametrize("planted", ["sigma halved at one airport", "far corners biased beyond 2 km"])
 def test_a_planted_fault_shows_in_its_group_and_in_no_other(planted, tmp_path):
     labels, found = made_up(tmp_path, 4000)
@@ -244,7 +258,10 @@ def test_a_planted_fault_shows_in_its_group_and_in_no_other(planted, tmp_path):
         writer = csv.DictWriter(file, list(guesses[0]))
         writer.writeheader()
         writer.writerows(guesses)
-    faulty = metrics_of(evaluate(Subject(found), labels, tmp_path / "b").rows)
+    rows = evaluate(Subject(found), labels, tmp_path / "b").rows
+    faulty = metrics_of(rows)
+    failed = [one["id"] for one in check(_REQUIRED, rows, figures_of) if one["result"] == "failed"]
+    assert failed == ["sigma at AP07" if planted.startswith("sigma") else "far corners beyond 2 km"]
 
     def figure(metrics, by, group, name):
         (one,) = [m for m in metrics if (m["by"], m["group"], m["name"]) == (by, group, name)]

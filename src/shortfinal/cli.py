@@ -294,6 +294,8 @@ def evaluate(
     corners: Corners = "",
     origin: OriginName = "corner",
     false_alarm_rate: Rate = 1e-3,
+    integrity_risk: Annotated[float, typer.Option(help="Of the protection levels: P(accepted and beyond them).")] = 1e-7,
+    fault_prior: Annotated[float, typer.Option(help="Of the protection levels: P(a feature is at fault).")] = 1e-4,
     seed: Annotated[int, typer.Option(min=0, help="Of the faults that are planted.")] = 0,
     as_json: Json = False,
 ) -> None:  # fmt: skip
@@ -316,7 +318,7 @@ def evaluate(
         def held(path: Path, folder: Path) -> Evaluation:
             return judge(
                 Subject(path), data, folder, runways=runways, camera=given, corners=_names(corners), origin=origin,
-                rates=Rates(false_alarm_rate), limits=limits, seed=seed, progress=seen,
+                rates=Rates(false_alarm_rate, integrity_risk, fault_prior), limits=limits, seed=seed, progress=seen,
             )  # fmt: skip
 
         made = held(subject, out)

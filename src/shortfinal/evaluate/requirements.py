@@ -295,7 +295,7 @@ def passed(records: Sequence[Mapping[str, Any]]) -> bool:
 def _judged(requirement: Requirement, figure: Figure, count: int) -> tuple[str, str]:
     value, low, high = figure.value, figure.low, figure.high
     unit = f" {figure.unit}" if figure.unit else ""
-    estimate = f"{value:.6g}{unit}, of {count} rows"
+    estimate = f"{value:.4g}{unit}, of {count} rows"
     if math.isnan(value):
         return NOT_SHOWN, f"the figure is not a number, of {count} rows"
     if not requirement.holds(value, value):
@@ -306,7 +306,7 @@ def _judged(requirement: Requirement, figure: Figure, count: int) -> tuple[str, 
         return SHOWN, f"{estimate}; judged by the estimate alone"
     if math.isnan(low) or math.isnan(high):
         return NOT_SHOWN, f"{estimate}; too few for an interval"
-    interval = f"{estimate}; the 95 % interval, {low:.6g} to {high:.6g}{unit},"
+    interval = f"{estimate}; the 95 % interval, {low:.4g} to {high:.4g}{unit},"
     if not requirement.holds(low, high):
         return NOT_SHOWN, f"{interval} reaches beyond {requirement.bound}"
     return SHOWN, f"{interval} lies within {requirement.bound}"
