@@ -294,8 +294,8 @@ def evaluate(
     corners: Corners = "",
     origin: OriginName = "corner",
     false_alarm_rate: Rate = 1e-3,
-    integrity_risk: Annotated[float, typer.Option(help="Of the protection levels: P(accepted and beyond them).")] = 1e-7,
-    fault_prior: Annotated[float, typer.Option(help="Of the protection levels: P(a feature is at fault).")] = 1e-4,
+    integrity_risk: Annotated[float, typer.Option(help="Of protection levels: P(accepted and beyond).")] = 1e-7,
+    fault_prior: Annotated[float, typer.Option(help="Of protection levels: P(a feature is at fault).")] = 1e-4,
     seed: Annotated[int, typer.Option(min=0, help="Of the faults that are planted.")] = 0,
     as_json: Json = False,
 ) -> None:  # fmt: skip

@@ -116,7 +116,7 @@
       .sort((a, b) => {
         const left = key(a), right = key(b);
         if (empty(left) || empty(right)) return empty(left) - empty(right) || a.row - b.row; // unknown ones last, either way
-        return -sign * (typeof left === "string" ? left.localeCompare(right, "en", { numeric: true }) : left - right) || a.row - b.row;
+        return sign * (typeof left === "string" ? left.localeCompare(right, "en", { numeric: true }) : left - right) || a.row - b.row;
       });
     showPage();
   }

@@ -9,7 +9,6 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 from typing import Any, TypeVar
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from shortfinal.evaluate.rows import DECISIONS, USE, Rows
 from shortfinal.files import write_whole
+from shortfinal.report.examples import ExamplePicture
 from shortfinal.report.plots import CAPTIONS
 
 MAX_ROWS = 4000  # of the explorer; more make the file large and tell nobody more
@@ -35,15 +35,6 @@ GLOSSARY = ("glossary", "How to read this", "")  # stands in page.html
 
 Metric = dict[str, Any]
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class ExamplePicture:
-    """A picture shown among the examples."""
-
-    row: int  # of Rows
-    title: str  # why it is shown: "largest sigma"
-    jpeg: bytes
 
 
 def write_page(
@@ -278,7 +269,10 @@ STEMS = {
     "level.along_m": "Along-track protection level, m",
     "level.cross_m": "Cross-track protection level, m",
     "level.vertical_m": "Vertical protection level, m",
-    "latency_ms": "Picture to verdict, ms",
+    "latency_ms": "Looking at a picture, ms",
+    "presence.auroc": "Area under the ROC curve, runway against crops beside it",
+    "presence.refused": "Runways taken for none",
+    "presence.false_find": "Crops without a runway taken for one",
     "detection.far_threshold_184m": "Would be refused were the runway 184 m shorter than believed",
 }
 COLUMNS = ("mean", "median", "50", "68", "90", "95", "99", "q90", "q95", "q99")
@@ -308,6 +302,7 @@ CHAPTERS = (
         (*("over_level", "along_over_level", "cross_over_level", "vertical_over_level", "available", "hazardous"),),
     ),
     ("Protection levels", ("level.along_m", "level.cross_m", "level.vertical_m")),
+    ("In scope or not", ("presence.auroc", "presence.refused", "presence.false_find")),
     ("Time", ("latency_ms",)),
 )
 
@@ -560,7 +555,9 @@ def _figures(evidence: dict[str, Any]) -> str:
     rest = tuple(dict.fromkeys(stem for stem, _ in map(_split, metrics) if stem not in placed))
     chapters = (_chapter(title, stems, metrics, other) for title, stems in (*CHAPTERS, ("Other", rest)))
     parts.append(f'<div class="chapters">{"".join(chapters)}</div>')
-    parts.append('<p class="soft">In brackets: the 95 % interval, which counts rows of one picture as dependent.</p>')
+    parts.append(
+        '<p class="soft">In brackets: the 95 % interval, which counts the coordinates of one row as alike.</p>'
+    )
     return "".join(parts)
 
 
