@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+from test_cli import call
 
 import shortfinal as sf
 from shortfinal.data.dataset import write_dataset
@@ -244,7 +245,7 @@ _REQUIRED = Requirements(None, (*_HONEST, *_SHARP))
 
 @pytest.mark.parametrize("planted", ["sigma halved at one airport", "far corners biased beyond 2 km"])
 def test_a_planted_fault_shows_in_its_group_and_in_no_other(planted, tmp_path):
-    labels, found = made_up(tmp_path, 4000)
+    labels, found = made_up(tmp_path, 3000)
     clean = metrics_of(evaluate(Subject(found), labels, tmp_path / "a").rows)
     truth, guesses = labels_of(tmp_path), list(csv.DictReader(found.open()))
     for label, guess in zip(truth, guesses):
@@ -278,3 +279,79 @@ def test_a_planted_fault_shows_in_its_group_and_in_no_other(planted, tmp_path):
             assert (after["low"] > 2 * before["high"]) == far
             near = [figure(m, "distance", group, "near_error_px.median")["value"] for m in (clean, faulty)]
             assert near[0] == near[1]
+
+
+# The command.
+
+
+def evaluated(capsys, *arguments):
+    """Exit status, standard output and the last line of standard error of the command."""
+    status, out, error = call(capsys, "evaluate", *arguments)
+    return status, out, (error.strip().splitlines() or [""])[-1]
+
+
+def test_the_command_writes_all_of_it_and_its_status_says_whether_requirements_hold(seen, frames, tmp_path, capsys):
+    kept = tmp_path / "kept"
+    evaluate(Subject(shipped_model()), frames, kept)
+    required = tmp_path / "required.toml"
+    required.write_text('[[requirement]]\nid = "R1"\nmetric = "error_px.median"\nat_most = 100\nfewest = 2\n')
+    out = tmp_path / "report"
+    arguments = (shipped_model(), "--data", frames, "--out", out, "--requirements", required)
+    shutil.copytree(kept, out)
+    status, told, last = evaluated(capsys, *arguments, "--compare", kept / "predictions.csv", "--json")
+    assert status == 0, last
+    said = json.loads(told)
+    assert [one["result"] for one in said["requirements"]] == ["shown"]
+    assert said["counts"]["labels"] == 10
+    written = {path.name for path in out.iterdir()}
+    assert {"report.html", "evaluation.json", "model_card.md", "manifest.json", "predictions.csv"} <= written
+    assert "figures" in written
+    assert {"rows.parquet", "metrics.parquet"} <= written
+    record = json.loads((out / "evaluation.json").read_text())
+    assert record["compare"]["name"] == "predictions.csv"
+    assert record["metrics"] == said["metrics"]
+    assert (out / shipped_model().name).stat().st_size > shipped_model().stat().st_size  # with its card
+    sf.KeypointDetector(out / shipped_model().name)
+
+    from shortfinal.evaluate.pack import verify_manifest
+
+    assert verify_manifest(out / "manifest.json", subject=shipped_model(), data=frames, requirements=required) == []
+    (out / "model_card.md").write_text("better")
+    assert any("model_card.md" in line for line in verify_manifest(out / "manifest.json"))
+
+    required.write_text(required.read_text().replace("at_most = 100", "at_most = 0.001"))
+    status, _, last = evaluated(capsys, *arguments, "--json")
+    assert status == 1
+    assert "R1 failed" in last
+
+
+def test_rows_as_parquet_say_what_rows_say(seen, tmp_path):
+    import pyarrow.parquet as parquet
+
+    from shortfinal.evaluate.tables import write_tables
+
+    assert write_tables(tmp_path, seen.rows, seen.evidence["metrics"]) == []
+    table = parquet.read_table(tmp_path / "rows.parquet").to_pydict()
+    assert table["decision"] == seen.rows.decision.tolist()
+    np.testing.assert_array_equal(table["found_far_left_v_px"], seen.rows.mean_px[:, 3, 1])
+    np.testing.assert_array_equal(table["along_error_m"], seen.rows.error_m[:, 0])
+    upper = seen.rows.cov_px[:, *np.triu_indices(8)]
+    np.testing.assert_array_equal(np.array(table["cov_px2"]), upper)
+    metrics = parquet.read_table(tmp_path / "metrics.parquet").to_pylist()
+    assert [m["name"] for m in metrics] == [m["name"] for m in seen.evidence["metrics"]]
+
+
+@pytest.mark.parametrize(
+    "arguments, says",
+    [
+        (["nothing.onnx"], "nothing.onnx"),
+        (["predictions.csv"], "predictions.csv"),
+        ([shipped_model(), "--requirements", "none.toml"], "none.toml"),
+        ([shipped_model(), "--runways", "none.json"], "none.json"),
+    ],
+)
+def test_what_is_not_there_is_named_in_one_line(arguments, says, frames, tmp_path, capsys):
+    status, _, last = evaluated(capsys, *arguments, "--data", frames, "--out", tmp_path / "out", "--json")
+    assert status == 2
+    assert last.startswith("shortfinal: ")
+    assert says in last
