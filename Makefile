@@ -20,7 +20,7 @@ check: .venv/dev            ## formatting, lint, types
 	$(BIN)/mypy
 
 bench: .venv/dev            ## the solver against its peers, faults, windows, distributions, campaigns, the renderer
-	for name in solver threshold_fault window distribution campaigns render; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+	for name in solver threshold_fault window distribution campaigns render tracker; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 clean:
 	rm -rf .venv results .pytest_cache .ruff_cache .mypy_cache .hypothesis
@@ -37,5 +37,5 @@ clean:
 
 .venv/dev: .venv/base
 	@echo "installing the training and development tools into .venv (once) ..."
-	$(PIP) -e ".[train,data,cluster,posterior]" --group dev
+	$(PIP) -e ".[train,data,cluster,posterior,mavlink,mcap]" --group dev
 	@touch $@

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from shortfinal.pose import PoseEstimate, PoseEstimateBatch, SolverStatus, estimate_pose, estimate_pose_batch
     from shortfinal.protection import AlertLimits, ProtectionLevels, protection_levels, protection_levels_batch
     from shortfinal.runway import Runway, find_runway
+    from shortfinal.tracker import Track, Tracker, TrackerSettings, TrackState
     from shortfinal.window import IntegrityWindow, RelativeMotion, WindowVerdict, check_window
 
 _HOME = {
@@ -72,6 +73,7 @@ _HOME = {
     "distribution": ("PoseSamples", "sample_pose"),
     "features": ("Altitude", "AttitudePrior", "Feature", "GaussianLines", "PositionPrior"),
     "protection": ("AlertLimits", "ProtectionLevels", "protection_levels", "protection_levels_batch"),
+    "tracker": ("Track", "Tracker", "TrackerSettings", "TrackState"),
     "window": ("IntegrityWindow", "RelativeMotion", "WindowVerdict", "check_window"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
@@ -108,6 +110,10 @@ __all__ = [
     "RelativeMotion",
     "Runway",
     "SolverStatus",
+    "Track",
+    "TrackState",
+    "Tracker",
+    "TrackerSettings",
     "WindowVerdict",
     "__version__",
     "check_integrity",

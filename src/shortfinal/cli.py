@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from shortfinal.demo import Flown
     from shortfinal.evaluate.frames import Evaluation as RunFigures
     from shortfinal.evaluate.run import Evaluation
-    from shortfinal.pipeline import FrameResult
+    from shortfinal.pipeline import FrameResult, LandingPipeline
+    from shortfinal.stream.fly import Sink
 
 T = TypeVar("T")
 
@@ -113,9 +114,10 @@ def demo(out: Out = Path("results/demo"), model: Model = None, as_json: Json = F
 
 @app.command()
 def run(
-    source: Annotated[Path, typer.Argument(help="Folder of images.")],
+    source: Annotated[str, typer.Argument(help="Folder of images, video file, camera:0, rtsp://..., or - for raw RGB "
+                                               "frames on standard input. With labels: the folder they are of.")],
     labels: Annotated[Path | None, typer.Option(help="LARD labels, or boxes: image, left, top, right, bottom. "
-                                                     "SOURCE/labels.csv by default.")] = None,
+                                                     "SOURCE/labels.csv by default, if it is there.")] = None,
     camera: CameraFile = None,
     runway: Annotated[str, typer.Option(help="Landing direction, e.g. LFPO/24, where the labels do not say.")] = "",
     runways: Runways = None,
@@ -123,17 +125,141 @@ def run(
     out: Out = Path("results/run"),
     model: Model = None,
     false_alarm_rate: Rate = 1e-3,
+    box: Annotated[str, typer.Option(help="In a flight's first frame: left,top,right,bottom, px.")] = "",
+    fps: Annotated[float | None, typer.Option(help="Frames a second of a folder; 30 by default.")] = None,
+    copies: Annotated[int, typer.Option(min=0, help="Keep a copy of every so many frames of a flight; 0: none.")] = 1,
+    mavlink: Annotated[str, typer.Option(help="To an autopilot: udpout:127.0.0.1:14550, /dev/ttyACM0:921600.")] = "",
+    mcap: Annotated[Path | None, typer.Option(help="Also as MCAP, for Foxglove.")] = None,
+    parquet: Annotated[Path | None, typer.Option(help="Also as Parquet, in parts, into this folder.")] = None,
+    rerun: Annotated[Path | None, typer.Option(help="Also for Rerun (.rrd).")] = None,
+    view: Annotated[bool, typer.Option("--view", help="Show the flight live in a browser.")] = False,
     as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Keypoints, pose and verdict for every labelled image of a folder."""
+    """A flight, frame after frame, or each labelled image of a folder: keypoints, pose, verdict."""
     from shortfinal.runway import find_runway
-    from shortfinal.stream.source import LabelledFolder, read_camera
+    from shortfinal.stream.source import read_camera
 
     given = _sized_runway(size, runway) if size else find_runway(runway, runways) if runway else None
-    folder = LabelledFolder(
-        source, labels or source / "labels.csv", camera=read_camera(camera) if camera else None,
-        runway=given, database=runways,
-    )  # fmt: skip
+    lens = read_camera(camera) if camera else None
+    if labels is None and not (Path(source) / "labels.csv").is_file():
+        sinks = _Sinks(mavlink, mcap, parquet, rerun, view, copies)
+        _fly(source, lens, given, out, model, false_alarm_rate, box, fps, sinks, as_json=as_json)
+        return
+    _run_labelled(Path(source), labels, lens, given, runways, out, model, false_alarm_rate, as_json=as_json)
+
+
+def _fly(
+    source: str, camera: Any, runway: Any, out: Path, model: Path | None, false_alarm_rate: float, box: str,
+    fps: float | None, wanted: _Sinks, *, as_json: bool,
+) -> None:  # fmt: skip
+    """A flight: `run` without labels."""
+    from shortfinal.detector import KeypointDetector, shipped_model
+    from shortfinal.evaluate.run import sha256_of
+    from shortfinal.pipeline import LandingPipeline
+    from shortfinal.stream.fly import BUDGET_MS, Log, flight_record, fly
+    from shortfinal.stream.frames import open_source
+    from shortfinal.tracker import Tracker
+
+    if camera is None:
+        raise InputError(f"{source}: a flight needs its camera: pass --camera (width, height, fx, fy, cx, cy)")
+    if runway is None:
+        raise InputError(f"{source}: a flight needs its runway: pass --size 2000x45, or --runway LFPO/24 and --runways")
+    frames = open_source(source, camera, fps)
+    path = model or shipped_model()
+    pipeline = LandingPipeline(
+        KeypointDetector(path), runway, camera, tracker=Tracker(), false_alarm_rate=false_alarm_rate
+    )
+    about = {"name": path.name, "sha256": sha256_of([path])}
+    flight = flight_record(source, pipeline, about, None, BUDGET_MS)
+    sinks = [*wanted.opened(pipeline, flight), Log(out, flight, wanted.copies)]
+    first = _box(box) if box else None
+    if not as_json:
+        _compile(levels=True)
+    with _bar() as bar:
+        task = bar.add_task("frames", total=getattr(frames, "count", None), visible=not as_json)
+        flown = fly(frames, pipeline, sinks, box=first, progress=lambda *_: bar.advance(task))
+    if as_json:
+        _print_json(asdict(flown) | {"out": str(out)})
+        return
+    decisions, states = (
+        ", ".join(f"{count} {name}" for name, count in counts.items()) for counts in (flown.decisions, flown.states)
+    )
+    console.print(f"{flown.frames} frames: {decisions}; track: {states}")
+    table = _table("", ("stage", "p50 ms", "p95 ms", "p99 ms"))
+    for stage, times in flown.stages.items():
+        table.add_row(stage.removesuffix("_ms"), *(f"{times[q]:.2f}" for q in ("p50", "p95", "p99")))
+    console.print(table)
+    console.print(f"{flown.dropped} frames overtaken by newer ones, {flown.misses} results later than {BUDGET_MS:g} ms")
+    for note in flown.notes:
+        console.print(Text(note))
+    console.print(f"written: {out}/flight.json, frames.jsonl; to look at: shortfinal view {out}")
+
+
+@dataclass(frozen=True)
+class _Sinks:
+    """Where a flight's results go besides its folder."""
+
+    mavlink: str
+    mcap: Path | None
+    parquet: Path | None
+    rerun: Path | None
+    view: bool
+    copies: int  # of every so many frames, in the folder
+
+    def opened(self, pipeline: LandingPipeline, flight: dict[str, Any]) -> list[Sink]:
+        """Those that are wanted."""
+        sinks: list[Sink] = []
+        if self.mavlink:
+            from shortfinal.stream.mavlink import MavlinkSink
+
+            sinks.append(MavlinkSink(self.mavlink))
+        if self.mcap:
+            from shortfinal.stream.mcap import McapSink
+
+            sinks.append(McapSink(self.mcap, pipeline.camera, pipeline.runway))
+        if self.parquet:
+            from shortfinal.stream.parquet import ParquetSink
+
+            sinks.append(ParquetSink(self.parquet))
+        if self.rerun:
+            from shortfinal.stream.rerun import RerunSink
+
+            sinks.append(RerunSink(self.rerun, pipeline.camera, pipeline.runway))
+        if self.view:
+            from shortfinal.stream.fly import Live
+
+            sinks.append(live := Live(flight))
+            console.print(f"live: {live.url}")
+        return sinks
+
+
+@app.command()
+def view(results: Annotated[Path, typer.Argument(help="Folder of a flight that run wrote.")]) -> None:
+    """A flight as a page to scrub through: the frame with its overlay, deviations, levels, reasons."""
+    from shortfinal.view.page import write_replay
+
+    page = write_replay(results)
+    console.print(f"written: {page}; open it in a browser")
+
+
+def _box(text: str) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 4 or not (values[0] < values[2] and values[1] < values[3]):
+        raise InputError(f"--box: {text!r}; expected left,top,right,bottom in pixels, left < right and top < bottom")
+    return values
+
+
+def _run_labelled(
+    source: Path, labels: Path | None, camera: Any, runway: Any, runways: Path | None, out: Path, model: Path | None,
+    false_alarm_rate: float, *, as_json: bool,
+) -> None:  # fmt: skip
+    """Each labelled image of a folder by itself."""
+    from shortfinal.stream.source import LabelledFolder
+
+    folder = LabelledFolder(source, labels or source / "labels.csv", camera=camera, runway=runway, database=runways)
     if not as_json:
         _compile(levels=True)
     evaluation, results = _run_folder(folder, out, model, false_alarm_rate, quiet=as_json)
@@ -673,7 +799,7 @@ def _print_json(record: dict[str, Any]) -> None:
 def _table(title: str, columns: tuple[str, ...]) -> Table:
     table = Table(title=title or None, title_justify="left", box=None, pad_edge=False)
     for name in columns:
-        words = name in ("fault", "verdict", "why", "corners", "image", "figure")
+        words = name in ("stage", "fault", "verdict", "why", "corners", "image", "figure")
         table.add_column(name, justify="left" if words else "right", no_wrap=name != "why")
     return table
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,6 +20,8 @@ from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
 from shortfinal.pose import PoseEstimate, estimate_pose
 from shortfinal.protection import FAULT_PRIOR, INTEGRITY_RISK, ProtectionLevels, protection_levels
 from shortfinal.runway import Runway
+from shortfinal.tracker import Track, Tracker, TrackState
+from shortfinal.window import RelativeMotion
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -49,6 +51,7 @@ class FrameResult:
     end_crops: tuple[PixelWindow, ...] = ()  # where it looked again, for one end each
     calibrated_on: str | None = None  # what the keypoints' sigma was mended with; None: it is the network's own
     bounds_95_px: Array | None = None  # (K, 2) split-conformal: 95 % of the errors are no larger; None: not calibrated
+    track: Track | None = None  # over time, this frame included; None without a tracker
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON. Lengths in metres, angles in degrees, pixels of the frame."""
@@ -79,14 +82,17 @@ class FrameResult:
             record["pose_cov"] = self.estimate.cov.tolist()
         if self.protection is not None:
             record["protection"] = self.protection.to_dict()
+        if self.track is not None:
+            record["track"] = self.track.to_dict()
         return record
 
 
 class LandingPipeline:
-    """Crop, detect, solve, doubt: one runway, one camera, frame after frame.
+    """Crop, detect, solve, doubt, track: one runway, one camera, frame after frame.
 
     Where to look comes with each frame: a box around the runway, or a prior pose (GNSS/INS), or
-    else the last frame whose pose was accepted. Frames must be of the camera's size.
+    else the track's prediction, or the last frame whose pose was accepted. Frames must be of the
+    camera's size.
     """
 
     def __init__(
@@ -96,12 +102,14 @@ class LandingPipeline:
         camera: Camera,
         *,
         further_points: ArrayLike | None = None,
+        tracker: Tracker | None = None,
         false_alarm_rate: float = FALSE_ALARM_RATE,
         integrity_risk: float = INTEGRITY_RISK,
         fault_prior: float = FAULT_PRIOR,
     ) -> None:
         """`further_points` (K - 4, 3): where the model's keypoints beyond the corners are on this runway, metres;
-        those that are seen take part. The last two are for the protection levels, as in `protection_levels`.
+        those that are seen take part. `tracker`: follows pose and velocity over the frames; without one each frame
+        stands alone. The last two are for the protection levels, as in `protection_levels`.
 
         Raises InputError for a probability outside (0, 1) or a model that finds other points than these.
         """
@@ -119,6 +127,7 @@ class LandingPipeline:
             check_rate(rate, name)
         self.detector, self.runway, self.camera = detector, runway, camera
         self.false_alarm_rate, self.integrity_risk, self.fault_prior = false_alarm_rate, integrity_risk, fault_prior
+        self.tracker = tracker
         self._last: Pose | None = None
 
     def step(
@@ -128,11 +137,13 @@ class LandingPipeline:
         *,
         box: ArrayLike | None = None,
         prior: Pose | None = None,
+        motion: RelativeMotion | None = None,
     ) -> FrameResult:
         """Process one frame (height, width, 3; RGB, uint8).
 
         `box` (4,): left, top, right, bottom in pixels; `prior`: a pose near enough for a crop
-        twice the runway's size to see most of it. Raises InputError for a frame of another size or
+        twice the runway's size to see most of it; `motion` of the camera since the last frame, by odometry,
+        for the tracker. Raises InputError for a frame of another size or
         type or a timestamp that is not finite; whatever fails after that is a verdict of
         NOT_MONITORED with its reason.
         """
@@ -144,11 +155,30 @@ class LandingPipeline:
             )
         if not math.isfinite(timestamp_s):
             raise InputError(f"timestamp_s: {timestamp_s}; it must be finite")
+        result = self._seen(frame_rgb, timestamp_s, box, prior)
+        return self._tracked(result, motion)
+
+    def coast(self, timestamp_s: float, reason: str) -> FrameResult:
+        """What there is to say without a frame: NOT_MONITORED for that reason, and the track carried on."""
+        return self._tracked(FrameResult(timestamp_s, None, None, None, self._not_monitored(reason)), None)
+
+    def _tracked(self, result: FrameResult, motion: RelativeMotion | None) -> FrameResult:
+        if self.tracker is None:
+            return result
+        start = time.perf_counter()
+        track = self.tracker.update(result.timestamp_s, result.estimate, result.verdict, motion)
+        result.timings["track_ms"] = 1e3 * (time.perf_counter() - start)
+        if track.state is TrackState.LOST:
+            self._last = None
+        return replace(result, track=track)
+
+    def _seen(self, frame_rgb: Image, timestamp_s: float, box: ArrayLike | None, prior: Pose | None) -> FrameResult:
         timings: dict[str, float] = {}
         try:
+            near = prior or self._expected(timestamp_s)
             wide = None if box is not None else WIDE_MARGIN
             sight = _timed(
-                timings, "detect_ms", lambda: see(self.detector, frame_rgb, self._first_box(box, prior), wide)
+                timings, "detect_ms", lambda: see(self.detector, frame_rgb, self._first_box(box, near), wide)
             )
         except InputError as error:
             return FrameResult(timestamp_s, None, None, None, self._not_monitored(str(error)), None, timings)
@@ -198,9 +228,13 @@ class LandingPipeline:
     def _not_monitored(self, reason: str) -> IntegrityVerdict:
         return IntegrityVerdict(Decision.NOT_MONITORED, (reason,), 0, self.false_alarm_rate)
 
-    def _first_box(self, box: ArrayLike | None, prior: Pose | None) -> Array:
+    def _expected(self, timestamp_s: float) -> Pose | None:
+        """Where the camera should be: by the track, or else where it last was."""
+        track = None if self.tracker is None else self.tracker.predict(timestamp_s)
+        return self._last if track is None or track.pose is None else track.pose
+
+    def _first_box(self, box: ArrayLike | None, near: Pose | None) -> Array:
         if box is None:
-            near = prior or self._last
             if near is None:
                 raise InputError("where to look is not known: no box, no prior pose, and no earlier frame was accepted")
             box = box_around(project(self.camera, near, self.runway.corners))
