@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import cv2
 import numpy as np
@@ -165,8 +165,8 @@ class PipeSource:
             raise JobError(f"-: the last frame has {len(content)} of {size} bytes; is it RGB of the camera's size?")
 
 
-def _rgb(picture: Image) -> Image:
-    return np.ascontiguousarray(picture[..., ::-1])
+def _rgb(picture: Any) -> Image:
+    return np.ascontiguousarray(picture[..., ::-1], np.uint8)
 
 
 class Mailbox:

@@ -215,7 +215,7 @@ def _may_be_used(result: FrameResult, track: Track | None) -> _Belief | None:
         return None
     if track is None:
         return _Belief(estimate.pose, estimate.cov, None)
-    if track.state is not TrackState.TRACKING or not track.taken:
+    if track.state is not TrackState.TRACKING or not track.taken or track.pose is None or track.cov is None:
         return None
     return _Belief(track.pose, track.cov, track.velocity_mps)
 
