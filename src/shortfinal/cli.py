@@ -157,9 +157,10 @@ def _fly(
     from shortfinal.evaluate.run import sha256_of
     from shortfinal.pipeline import LandingPipeline
     from shortfinal.stream.fly import BUDGET_MS, Log, flight_record, fly
-    from shortfinal.stream.frames import open_source
+    from shortfinal.stream.frames import check_source, open_source
     from shortfinal.tracker import Tracker
 
+    check_source(source)
     if camera is None:
         raise InputError(f"{source}: a flight needs its camera: pass --camera (width, height, fx, fy, cx, cy)")
     if runway is None:

@@ -50,6 +50,7 @@ def open_source(text: str, camera: Camera, fps: float | None = None) -> FrameSou
     `fps` times the frames of a folder, or of a video that does not say; 30 if not given. Raises InputError for a
     source that cannot be opened.
     """
+    check_source(text)
     if fps is not None and not 0 < fps <= 1000:
         raise InputError(f"--fps: {fps:g}; expected a number of frames a second up to 1000")
     if text == "-":
@@ -57,11 +58,13 @@ def open_source(text: str, camera: Camera, fps: float | None = None) -> FrameSou
     if text.startswith("camera:") or "://" in text:
         return LiveSource(text)
     path = Path(text)
-    if path.is_dir():
-        return FolderSource(path, fps or FPS)
-    if path.is_file():
-        return VideoSource(path, fps)
-    raise InputError(f"{text}: no such folder or video; also camera:0, rtsp://..., or - for a pipe")
+    return FolderSource(path, fps or FPS) if path.is_dir() else VideoSource(path, fps)
+
+
+def check_source(text: str) -> None:
+    """Raises InputError for a folder or video that is not there."""
+    if text != "-" and not text.startswith("camera:") and "://" not in text and not Path(text).exists():
+        raise InputError(f"{text}: no such folder or video; also camera:0, rtsp://..., or - for a pipe")
 
 
 class FolderSource:
