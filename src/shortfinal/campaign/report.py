@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaincinv
 
 from shortfinal.campaign.config import Campaign, Scenario
 from shortfinal.campaign.trials import (
@@ -26,6 +25,7 @@ from shortfinal.campaign.trials import (
     TAIL_RATES,
     Counts,
 )
+from shortfinal.evaluate.intervals import CONFIDENCE, share_interval
 from shortfinal.files import csv_text, make_folder, write_whole
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-CONFIDENCE = 0.95  # of every interval
 _MOST_NAMED = 12  # scenarios in a legend
 QUANTILES = {"median": 0.5, "q95": 0.95}
 
@@ -53,9 +52,7 @@ class Rate:
 
 def rate_of(count: int, of: int) -> Rate:
     """`count` of `of`, with its exact (Clopper & Pearson 1934) two-sided interval."""
-    tail = (1 - CONFIDENCE) / 2
-    low = float(betaincinv(count, of - count + 1, tail)) if count > 0 else 0.0
-    high = float(betaincinv(count + 1, of - count, 1 - tail)) if count < of else 1.0
+    low, high = share_interval(count / of, of) if of else (0.0, 1.0)
     return Rate(count, of, count / of if of else None, low, high)
 
 

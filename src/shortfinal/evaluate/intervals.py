@@ -46,7 +46,7 @@ def share_figure(flags: Array | NDArray[np.bool_]) -> Figure | None:
     if total == 0:
         return None
     share = float(sums.sum() / total)
-    low, high = _share_interval(share, _worth(sums - share * counts, counts, share))
+    low, high = share_interval(share, _worth(sums - share * counts, counts, share))
     return Figure(share, low, high, total, "")
 
 
@@ -63,7 +63,7 @@ def quantile_figures(values: Array, levels: Sequence[float], unit: str = "") -> 
     for level in levels:
         at = float(np.quantile(known, level))
         below = _by_row(np.where(np.isnan(values), np.nan, values <= at))[0]
-        ends = _share_interval(level, _worth(below - level * counts, counts, level))
+        ends = share_interval(level, _worth(below - level * counts, counts, level))
         low, high = (float(end) for end in np.quantile(known, ends))
         figures.append(Figure(at, low, high, len(known), unit))
     return figures
@@ -85,7 +85,7 @@ def auroc_figure(inside: Array, outside: Array) -> Figure | None:
         return Figure(area, math.nan, math.nan, pairs, "")
     variance = float(sum(np.var(shares, ddof=1) / len(shares) for shares in above))
     if variance == 0:
-        return Figure(area, *_share_interval(area, min(len(a), len(b))), pairs, "")
+        return Figure(area, *share_interval(area, min(len(a), len(b))), pairs, "")
     reach = float(ndtri(1 - _TAIL)) * math.sqrt(variance) / (area * (1 - area))
     low, high = expit(logit(area) + np.array([-reach, reach]))
     return Figure(area, float(low), float(high), pairs, "")
@@ -122,7 +122,7 @@ def _worth(residuals: Array, counts: Array, share: float) -> float:
     return float(min(draws * loss, counts.sum()))
 
 
-def _share_interval(share: float, draws: float) -> tuple[float, float]:
+def share_interval(share: float, draws: float) -> tuple[float, float]:
     """Clopper & Pearson (1934), for a number of draws that need not be whole."""
     hits = share * draws
     low = float(betaincinv(hits, draws - hits + 1, _TAIL)) if hits > 0 else 0.0
