@@ -21,6 +21,8 @@ from shortfinal.evaluate.requirements import Condition, Requirement, Requirement
 from shortfinal.evaluate.run import FITTED, Subject, evaluate
 from shortfinal.protection import AlertLimits
 
+BENCHMARK = "evaluation"
+
 CAMERA = sf.Camera(640, 640, 1200.0, 1200.0, 319.5, 319.5)
 LIMITS = AlertLimits(along_m=500, cross_m=100, vertical_m=50)
 
@@ -60,17 +62,6 @@ def predictions(path, labels, sigma=0.5, seed=0, spread=1.0, edit=None):
                 edit(label, cells)
             writer.writerow(cells)
     return path
-
-
-def made_up(folder, count, seed=0):
-    """Labels of approaches to ten airports' runways, and no pictures."""
-    import importlib.util
-    from pathlib import Path
-
-    spec = importlib.util.spec_from_file_location("made_up", Path(__file__).parents[1] / "benchmarks" / "evaluation.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.make(folder, count, seed)
 
 
 def test_a_model_is_held_against_rendered_frames(seen, frames):
@@ -133,8 +124,8 @@ def test_predictions_made_elsewhere_are_judged_alike(seen, frames, tmp_path):
     np.testing.assert_allclose(again.rows.error_m, seen.rows.error_m, rtol=1e-4, atol=1e-2)
 
 
-def test_figures_of_known_errors(tmp_path):
-    labels, found = made_up(tmp_path, 3000)
+def test_figures_of_known_errors(tmp_path, benchmark):
+    labels, found = benchmark.make(tmp_path, 3000)
     made = evaluate(Subject(found), labels, tmp_path / "out", rates=Rates(false_alarm_rate=0.01), limits=LIMITS)
     figures = figures_of(made.rows, LIMITS)
     assert set(figures) <= set(METRICS)
@@ -158,8 +149,8 @@ def test_figures_of_known_errors(tmp_path):
     assert figures["error_px.mean"].value == pytest.approx(0.5 * np.exp(0.08) * (2 / np.pi) ** 0.5, rel=0.03)
 
 
-def test_every_row_is_in_its_groups(tmp_path):
-    labels, found = made_up(tmp_path, 400)
+def test_every_row_is_in_its_groups(tmp_path, benchmark):
+    labels, found = benchmark.make(tmp_path, 400)
     made = evaluate(Subject(found), labels, tmp_path / "out")
     metrics = metrics_of(made.rows)
     for by in ("all", "distance", "glide"):
@@ -168,8 +159,8 @@ def test_every_row_is_in_its_groups(tmp_path):
     json.dumps(made.evidence, allow_nan=False)
 
 
-def test_without_sigma_one_is_fitted_and_that_is_said(frames, tmp_path):
-    labels, found = made_up(tmp_path, 300)
+def test_without_sigma_one_is_fitted_and_that_is_said(frames, tmp_path, benchmark):
+    labels, found = benchmark.make(tmp_path, 300)
     text = [line.split(",")[:9] for line in found.read_text().splitlines()]
     found.write_text("\n".join(",".join(cells) for cells in text))
     made = evaluate(Subject(found), labels, tmp_path / "out")
@@ -184,9 +175,9 @@ def test_without_sigma_one_is_fitted_and_that_is_said(frames, tmp_path):
         evaluate(Subject(few), labels, tmp_path / "out")
 
 
-def test_nothing_is_dropped_silently(tmp_path):
+def test_nothing_is_dropped_silently(tmp_path, benchmark):
     """A corrupt row, a NaN sigma, a missing prediction, a stranger: each is counted, named, and a row of its own."""
-    labels, found = made_up(tmp_path, 60)
+    labels, found = benchmark.make(tmp_path, 60)
     lines = found.read_text().splitlines()
     lines[3] = lines[3].replace(",", ";", 3)
     cells = lines[5].split(",")
@@ -243,9 +234,10 @@ _SHARP = [
 _REQUIRED = Requirements(None, (*_HONEST, *_SHARP))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planted", ["sigma halved at one airport", "far corners biased beyond 2 km"])
-def test_a_planted_fault_shows_in_its_group_and_in_no_other(planted, tmp_path):
-    labels, found = made_up(tmp_path, 3000)
+def test_a_planted_fault_shows_in_its_group_and_in_no_other(planted, tmp_path, benchmark):
+    labels, found = benchmark.make(tmp_path, 3000)
     clean = metrics_of(evaluate(Subject(found), labels, tmp_path / "a").rows)
     truth, guesses = labels_of(tmp_path), list(csv.DictReader(found.open()))
     for label, guess in zip(truth, guesses):
@@ -290,6 +282,7 @@ def evaluated(capsys, *arguments):
     return status, out, (error.strip().splitlines() or [""])[-1]
 
 
+@pytest.mark.slow
 def test_the_command_writes_all_of_it_and_its_status_says_whether_requirements_hold(seen, frames, tmp_path, capsys):
     kept = tmp_path / "kept"
     evaluate(Subject(shipped_model()), frames, kept)

@@ -2,9 +2,7 @@
 
 import itertools
 import json
-import os
 import re
-import shutil
 from html.parser import HTMLParser
 
 import numpy as np
@@ -301,18 +299,6 @@ def test_a_folder_that_is_not_there_is_refused(tmp_path):
 # --- in a browser
 
 
-@pytest.fixture(scope="module")
-def chromium():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-    if path is None:
-        pytest.skip("no chromium here; install it, or name it in CHROMIUM")
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=path, args=["--no-sandbox"])  # containers have none
-        yield browser
-        browser.close()
-
-
 @pytest.fixture
 def opened(chromium, tmp_path):
     """Opens the page; fails at the end if it asked for anything, or if anything was wrong."""
@@ -383,10 +369,13 @@ def test_rows_sort_filter_and_open(opened):
 def test_links_lead_to_rows(opened):
     page = opened()
     page.locator(".examples a").first.click()
-    assert "row 3" in page.locator("#detail").inner_text()
+    page.wait_for_function("document.querySelector('#detail').innerText.includes('row 3')")
     assert page.locator("#table tr.chosen").get_attribute("data-row") == "3"
     page.locator("#close").click()
     page.locator(".groups a", has_text="BIRK").click()
+    page.wait_for_function(
+        "![...document.querySelectorAll('#table tbody tr')].some(r => /EDDM|LFPO/.test(r.innerText))"
+    )
     assert set(cells(page, "Runway")) == {"BIRK/24"}
 
 

@@ -3,8 +3,6 @@
 import base64
 import json
 import math
-import os
-import shutil
 import socket
 import time
 import urllib.error
@@ -236,18 +234,6 @@ def test_a_folder_without_a_flight_is_refused(records, tmp_path):
 
 
 # --- in a browser
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = os.environ.get("CHROMIUM") or shutil.which("chromium")
-    if path is None:
-        pytest.skip("no chromium here; install it, or name it in CHROMIUM")
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=path, args=["--no-sandbox"])  # containers have none
-        yield browser
-        browser.close()
 
 
 @pytest.fixture
