@@ -223,6 +223,7 @@ def test_the_window_must_have_the_models_size():
         sf.KeypointDetector().detect(np.zeros((9, 9, 3), np.uint8), sf.PixelWindow(0, 0, 9, 9, 100, 100))
 
 
+@pytest.mark.slow
 def test_the_shipped_model_finds_the_corners_of_scenes_it_never_saw():
     from shortfinal.calibrate import framed
     from shortfinal.data.augment import inside

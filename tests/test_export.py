@@ -107,6 +107,7 @@ def test_the_file_answers_as_torch_for_any_number_of_pictures(tmp_path, network)
     detector.detect(np.zeros((SIZE, SIZE, 3), np.uint8), sf.PixelWindow(0, 0, SIZE, SIZE, SIZE, SIZE))
 
 
+@pytest.mark.slow
 def test_export_describes_itself(folder, tmp_path):
     info = export(folder / "best.pt", tmp_path / "model.onnx", data=folder / "data")
     assert sf.KeypointDetector(tmp_path / "model.onnx").info == info
@@ -149,6 +150,7 @@ def test_int8_loses_no_more_than_it_may(folder, tmp_path):
     assert not any(part in name for name in eight_bit for part in ("net.neck", "net.score", "net.spread"))
 
 
+@pytest.mark.slow
 def test_int8_that_loses_more_is_not_offered(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(LIMITS, "int8", Difference(1e-5, 1.0, 1.0))
     message = (

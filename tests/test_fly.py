@@ -14,8 +14,10 @@ import pytest
 from test_cli import call, refused
 
 import shortfinal as sf
-from shortfinal.demo import CAMERA, RUNWAY, approach_pose, demo_scene, render_frame
+from shortfinal.demo import CAMERA, RUNWAY, approach_pose, demo_scene
 from shortfinal.errors import InputError, JobError
+from shortfinal.scene.render import render
+from shortfinal.scene.sensor import Sensor
 from shortfinal.stream.fly import Log, flight_record, fly
 from shortfinal.stream.frames import FolderSource, Mailbox, PipeSource, TimedFrame, VideoSource, open_source
 
@@ -25,7 +27,8 @@ FRAMES = 8
 @pytest.fixture(scope="module")
 def pictures():
     scene = demo_scene()
-    return [render_frame(scene, k) for k in range(FRAMES)]
+    sensor = Sensor(0.5, 2.0, 92)
+    return [render(scene, CAMERA, approach_pose(k), sensor, samples=1, seed=k) for k in range(FRAMES)]
 
 
 @pytest.fixture(scope="module")

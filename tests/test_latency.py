@@ -38,6 +38,7 @@ def test_calls_take_turns(benchmark):
     assert times["fast"].min() >= 1
 
 
+@pytest.mark.slow
 def test_openvino_in_a_process_of_its_own():
     pytest.importorskip("openvino")
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", __file__, "-k", "both_runtimes or the_table"]

@@ -104,6 +104,7 @@ def check_outlines(seeds):
         assert corner_errors(scene, camera, pose, corners).max() < 0.05
 
 
+@pytest.mark.slow
 def test_corners_of_random_scenes_lie_where_the_labels_say():
     check_outlines(range(30))
 

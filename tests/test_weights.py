@@ -236,6 +236,7 @@ def test_a_folded_file_of_no_use_is_one_line(tmp_path, spoil, message):
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
 
 
+@pytest.mark.slow
 @needs_data
 def test_the_folded_file_is_of_one_network():
     for name, message in (("test_efficientnet", "layer 0 is"), ("test_vit", "holds 53 layers; the network has")):
