@@ -356,9 +356,10 @@ def test_training_resumes_to_the_same_curve_and_weights(recipe, done, tmp_path, 
 
 TRAINING = """
 import json, sys
-from shortfinal.train.fit import train
+from shortfinal.train.fit import leave, train
 from shortfinal.train.recipe import Recipe
 train(Recipe(**json.loads(sys.argv[1])))
+leave()
 """
 
 

@@ -358,6 +358,7 @@ def train(
     ] = None,
 ) -> None:
     """Train a network; run again with the same --out to go on after a stop. `torchrun` shares it among processes."""
+    from shortfinal.train.fit import leave
     from shortfinal.train.fit import train as fit
     from shortfinal.train.recipe import make_recipe, parse_change, read_recipe
 
@@ -370,6 +371,7 @@ def train(
     made = read_recipe(recipe, changes) if recipe else make_recipe(preset, changes)
     figures = fit(made, console)
     console.print(f"best checkpoint: {made.out}/best.pt, " + ", ".join(f"{k} {v:.3f}" for k, v in figures.items()))
+    leave()
 
 
 @app.command()
