@@ -93,11 +93,11 @@ def test_damage_is_one_line_that_names_the_field(changes, message):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "cannot be read: No such file or directory"),
-        (b"data = ", "not TOML: "),
-        (b"data = 'a'\ndata = 'b'", "not TOML: "),
-        (b"\xff\xfe\x00", "not TOML: "),
-        (b"x = " + b"[" * 3000, "not TOML: "),
+        (None, "cannot read the recipe: No such file or directory"),
+        (b"data = ", "not a TOML file: "),
+        (b"data = 'a'\ndata = 'b'", "not a TOML file: "),
+        (b"\xff\xfe\x00", "not a TOML file: "),
+        (b"x = " + b"[" * 3000, "not a TOML file: "),
         (b"seed = 3", "data: missing; the folder, or folders, to train on"),
         (b"preset = 'paper'\ndata = 'a'", "preset: 'paper'; expected one of default, paper-resnet, paper-efficientnet"),
         (b"data = 'a'\n[network]\nwidth = 3", "network: no such field"),
@@ -112,7 +112,7 @@ def test_a_file_of_no_use_is_named(tmp_path, content, message):
         read_recipe(path)
     assert str(refusal.value).startswith(f"{path}: {message}")
     assert "\n" not in str(refusal.value)
-    with pytest.raises(sf.InputError, match="cannot be read: Is a directory"):
+    with pytest.raises(sf.InputError, match="cannot read the recipe: Is a directory"):
         read_recipe(tmp_path)
 
 

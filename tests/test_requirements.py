@@ -257,9 +257,9 @@ def where(text):
 # What is damaged, and what the one line must say.
 DAMAGE = [
     (None, "cannot read the requirements: No such file or directory"),
-    (b"\xff\xfe", "not TOML: "),
-    ("[[requirement]", "not TOML: "),
-    (f"{GOOD}\nat_least = 1", "not TOML: "),
+    (b"\xff\xfe", "not a TOML file: "),
+    ("[[requirement]", "not a TOML file: "),
+    (f"{GOOD}\nat_least = 1", "not a TOML file: "),
     ("", "no requirement in it; write each under [[requirement]]"),
     ("requirement = 3", "requirement: expected tables, each under [[requirement]]"),
     (GOOD.replace("[[requirement]]", "[requirement]"), "requirement: expected tables, each under [[requirement]]"),

@@ -154,7 +154,7 @@ def _fly(
 ) -> None:  # fmt: skip
     """A flight: `run` without labels."""
     from shortfinal.detector import KeypointDetector, shipped_model
-    from shortfinal.evaluate.run import sha256_of
+    from shortfinal.files import sha256_of
     from shortfinal.pipeline import LandingPipeline
     from shortfinal.stream.fly import BUDGET_MS, Log, flight_record, fly
     from shortfinal.stream.frames import check_source, open_source

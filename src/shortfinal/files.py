@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
+import tomllib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -52,6 +54,29 @@ def read_json(path: str | Path, what: str) -> Any:
         raise InputError(f"{path}: cannot read the {what}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a JSON file: {error}") from error
+
+
+def read_toml(path: str | Path, what: str) -> dict[str, Any]:
+    """The content of a TOML file; a byte-order mark is let pass. Raises InputError naming the file and `what` it is."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the {what}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:  # tomllib's own and Unicode's are ValueErrors
+        raise InputError(f"{path}: not a TOML file: {error}") from error
+
+
+def sha256_of(paths: Iterable[Path]) -> str:
+    """SHA-256 of the content of files, one after the other. Raises InputError naming the one that cannot be read."""
+    digest = hashlib.sha256()
+    for path in paths:
+        try:
+            with path.open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    return digest.hexdigest()
 
 
 def claim(stamp: Path, made_of: Mapping[str, Any], otherwise: str) -> None:

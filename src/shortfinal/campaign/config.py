@@ -10,13 +10,13 @@ from __future__ import annotations
 import difflib
 import itertools
 import math
-import tomllib
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 from shortfinal.errors import InputError
+from shortfinal.files import read_toml
 from shortfinal.geometry import Camera
 from shortfinal.keypoints import CORNER_NAMES
 
@@ -210,12 +210,7 @@ def read_campaign(path: str | Path) -> Campaign:
     poses, runway, sigma, correlation, priors, fault and monitor. Raises InputError naming the file
     and the key.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the campaign: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: not a TOML file: {error}") from error
+    content = read_toml(path, "campaign")
     try:
         return _campaign(content)
     except InputError as error:

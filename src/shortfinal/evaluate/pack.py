@@ -19,7 +19,7 @@ from typing import Any
 from shortfinal.errors import InputError, JobError
 from shortfinal.evaluate.card import Evidence, without_card
 from shortfinal.evaluate.requirements import passed
-from shortfinal.files import read_json, write_whole
+from shortfinal.files import read_json, sha256_of, write_whole
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -224,11 +224,7 @@ def _file(path: Path, name: str) -> dict[str, Any]:
 
 def _digest(path: Path) -> tuple[str, int]:
     """SHA-256 and size, however large the file is."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest(), file.tell()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    return sha256_of([path]), path.stat().st_size
 
 
 def _code(package_version: str) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -31,6 +30,7 @@ from shortfinal.evaluate.figures import (
     is_share,
 )
 from shortfinal.evaluate.rows import AXES, DECISIONS, Figure, Flags, Rows
+from shortfinal.files import read_toml
 from shortfinal.protection import AlertLimits
 
 Judge = Literal["interval", "estimate"]
@@ -123,12 +123,7 @@ def read_requirements(path: str | Path) -> Requirements:
     Raises InputError, one line that names the file, the requirement (by id, or by its number from 1), the field
     and the mend, for whatever is missing, unknown or of no use.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the requirements: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
+    content = read_toml(path, "requirements")
     try:
         return _requirements(content)
     except InputError as error:

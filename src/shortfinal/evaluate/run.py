@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections import Counter
@@ -29,7 +28,7 @@ from shortfinal.evaluate.judge import NOMINAL, Problems, Rates, Solved, reasons_
 from shortfinal.evaluate.predict import predict
 from shortfinal.evaluate.rows import AXES, DO_NOT_USE, MISSING, NOT_MONITORED, USE, Rows
 from shortfinal.evaluate.truth import Known, Truth, read_truth
-from shortfinal.files import make_folder
+from shortfinal.files import make_folder, sha256_of
 from shortfinal.geometry import Camera
 from shortfinal.protection import AlertLimits
 
@@ -125,19 +124,6 @@ def evaluate(
 
 
 FITTED = "fitted here, not predicted"
-
-
-def sha256_of(paths: Iterable[Path]) -> str:
-    """Of the content of files, one after the other. Raises InputError naming the one that cannot be read."""
-    digest = hashlib.sha256()
-    for path in paths:
-        try:
-            with path.open("rb") as file:
-                while block := file.read(1 << 20):
-                    digest.update(block)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    return digest.hexdigest()
 
 
 def label_files(truth: Truth) -> list[Path]:

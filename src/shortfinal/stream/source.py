@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from shortfinal.data.image import read_image
 from shortfinal.data.lard import labels_of
 from shortfinal.data.table import Refusal, Row, read_table
 from shortfinal.errors import InputError
+from shortfinal.files import read_toml
 from shortfinal.geometry import Camera, PixelWindow
 from shortfinal.runway import Runway, RunwayDatabase, load_database
 
@@ -161,12 +161,7 @@ def read_camera(path: str | Path) -> Camera:
 
     Raises InputError naming the file and the field.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the camera: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a TOML file: {error}") from error
+    content = read_toml(path, "camera")
     content = content.get("camera", content)
     names = ("width", "height", "fx", "fy", "cx", "cy")
     missing = [n for n in names if n not in content]

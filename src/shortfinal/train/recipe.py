@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from shortfinal.errors import InputError
+from shortfinal.files import read_toml
 from shortfinal.keypoints import CORNER_NAMES
 from shortfinal.train.loss import Likelihood
 from shortfinal.train.model import Covariance, Head
@@ -107,12 +108,7 @@ def read_recipe(path: str | Path, changes: Mapping[str, Any] | None = None) -> R
 
     Raises InputError naming the file and the field for what is missing, unknown or of no use.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
+    content = read_toml(path, "recipe")
     try:
         return make_recipe(str(content.pop("preset", "default")), {**content, **(changes or {})})
     except InputError as error:
