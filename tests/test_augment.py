@@ -292,13 +292,13 @@ def test_some_crops_of_a_whole_runway_are_beside_it_and_some_cut_it():
 def test_without_weather_the_picture_is_only_cut():
     shot = example(CORNERS, 2.5)
     for seed in range(4):  # none of which moves the crop off the runway
-        crop, corners = augmented_crop(shot, SIZE, np.random.default_rng(seed), native=True, weather=False)
+        crop, corners = augmented_crop(shot, SIZE, np.random.default_rng(seed), kind="native", weather=False)
         warp = native_warp(CORNERS, (640, 480), SIZE, np.random.default_rng(seed))
         np.testing.assert_array_equal(crop, warp.cut(shot.image))
         np.testing.assert_array_equal(corners, warp.apply(CORNERS))
         # What is not whole has no such crop, and is framed.
         cut = Example(shot.image, CUT)
-        _, framed = augmented_crop(cut, SIZE, np.random.default_rng(seed), native=True, weather=False)
+        _, framed = augmented_crop(cut, SIZE, np.random.default_rng(seed), kind="native", weather=False)
         warp = random_warp(within(cut), (640, 480), SIZE, np.random.default_rng(seed))
         np.testing.assert_array_equal(framed, warp.apply(within(cut)))
 
@@ -310,7 +310,7 @@ def test_further_keypoints_move_and_change_sides_with_the_corners():
     orders = set()
     for seed in range(20):
         shot = Example(np.zeros((480, 640, 3), np.uint8), points, names)
-        options = {"weather": False, "native": True}
+        options = {"weather": False, "kind": "native"}
         _, four = augmented_crop(Example(shot.image, CORNERS), SIZE, np.random.default_rng(seed), **options)
         _, eight = augmented_crop(shot, SIZE, np.random.default_rng(seed), **options)
         np.testing.assert_array_equal(eight[:4], four)

@@ -22,7 +22,10 @@ def checkpoint(path, keypoints=sf.CORNER_NAMES, sharp=300.0, **network):
     recipe = Recipe(("/home/somebody/pictures",), backbone="mobilenetv3_small_050", features=(8, 16, 32), width=16,
                     size=SIZE, keypoints=keypoints, mean=(0.4, 0.5, 0.6), **network)  # fmt: skip
     torch.manual_seed(0)
-    net = KeypointNet(recipe.backbone, len(keypoints), recipe.head, recipe.covariance, recipe.features, recipe.width)
+    net = KeypointNet(
+        recipe.backbone, len(keypoints), recipe.head, recipe.covariance, recipe.features, recipe.width,
+        where=recipe.learn == "where",
+    )  # fmt: skip
     with torch.no_grad():
         for name, weight in net.named_parameters():
             if name.startswith(("score", "spread", "correlation", "present", "fc")):
@@ -105,6 +108,39 @@ def test_the_file_answers_as_torch_for_any_number_of_pictures(tmp_path, network)
     detector = sf.KeypointDetector(tmp_path / "model.onnx")
     assert detector.info == info
     detector.detect(np.zeros((SIZE, SIZE, 3), np.uint8), sf.PixelWindow(0, 0, SIZE, SIZE, SIZE, SIZE))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["fp32", "fp16"])
+def test_where_runways_are_is_told_on_request(tmp_path, precision):
+    path = checkpoint(tmp_path / "best.pt", learn="where", crop="tile", start="another.pt")
+    export(path, tmp_path / "model.onnx", precision)
+    detector = sf.KeypointDetector(tmp_path / "model.onnx")
+    assert detector.searches
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(tmp_path / "model.onnx"), providers=["CPUExecutionProvider"])
+    network, _ = load_network(path)
+    for count in (1, 3):
+        pictures = random_pictures(SIZE, count, seed=count)
+        with torch.inference_mode():
+            wanted = network(torch.from_numpy(pictures))[-1].numpy()
+        (asked,) = session.run(["where"], {"image": pictures, "search": np.array(True)})
+        assert asked.shape == wanted.shape == (count, 2, SIZE // 16, SIZE // 16)
+        np.testing.assert_allclose(asked, wanted, rtol=1e-4 if precision == "fp32" else 0.02, atol=1e-3)
+        (unasked,) = session.run(["where"], {"image": pictures})
+        assert unasked.size == 0  # a look at a crop does not pay for it
+    spots = detector.spots(np.zeros((SIZE, SIZE, 3), np.uint8), [sf.PixelWindow(0, 0, SIZE, SIZE, SIZE, SIZE)])
+    assert spots == sorted(spots, reverse=True)
+
+
+@pytest.mark.slow
+def test_a_model_that_cannot_search_says_so(folder, tmp_path):
+    export(folder / "best.pt", tmp_path / "model.onnx")
+    detector = sf.KeypointDetector(tmp_path / "model.onnx")
+    assert not detector.searches
+    with pytest.raises(sf.InputError, match="does not say where runways are"):
+        detector.spots(np.zeros((SIZE, SIZE, 3), np.uint8), [sf.PixelWindow(0, 0, SIZE, SIZE, SIZE, SIZE)])
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import shortfinal as sf
 torch = pytest.importorskip("torch")
 
 from shortfinal.train.fit import Batch, Run  # noqa: E402
-from shortfinal.train.loss import attention_loss, gaussian_nll, scope_loss  # noqa: E402
+from shortfinal.train.loss import attention_loss, gaussian_nll, scope_loss, where_loss  # noqa: E402
 from shortfinal.train.model import Prediction, soft_argmax  # noqa: E402
 from shortfinal.train.recipe import make_recipe  # noqa: E402
 
@@ -149,6 +149,23 @@ def test_nearly_equal_coordinates_keep_their_digits():
     single = gaussian_nll(error.float(), sigma.float(), unit_rows(free).float(), visible)
     # The small entry, 1e-4, has float32's 6e-8 of the large one as its error, and enters squared.
     assert float(single) == pytest.approx(float(exact), rel=4 * 6e-8 / 1e-4)
+
+
+def test_the_search_learns_in_which_cell_and_how_long():
+    """Free maps go where the loss is least: the cell of the centre, the box's longer side; nowhere without a runway."""
+    nothing = [float("nan")] * 4
+    boxes = torch.tensor([[36.0, 20.0, 44.0, 60.0], nothing, [100.0, 20.0, 110.0, 60.0], nothing])
+    visible = torch.tensor([[1.0] * 4, [0.0] * 4, [0.0] * 4, [1.0, 1.0, 0.0, 0.0]])
+    maps = torch.zeros(4, 2, 8, 8, requires_grad=True)
+    minimised(lambda: where_loss(maps, boxes, visible, 64).sum(), maps)
+    share, side = maps[:, 0].detach().sigmoid(), maps[:, 1].detach().exp()
+    assert (share[0] > 0.9).nonzero().tolist() == [[5, 5]]  # (40, 40) of 64 pixels, in cells of eight
+    assert side[0, 5, 5] == pytest.approx(40.0, rel=0.01)
+    # Far from the centre it is told that there is none; in cells beside it, less.
+    assert share[0, 0, 0] < 0.1 < share[0, 5, 6] / share[0, 0, 0]
+    assert share[1].max() < 0.1
+    assert share[2].max() < 0.1  # its centre lies beyond the picture
+    np.testing.assert_array_equal(maps[3].detach(), 0)  # of an end alone the box is not known: it teaches nothing
 
 
 def test_beta_and_correlations_do_not_go_together():

@@ -228,7 +228,9 @@ def answers():
     visible = torch.tensor([[1.0, 1, 1, 1], [0, 0, 1, 1], [0, 0, 0, 0]])
     off = [[[1.0, -3]] * 4, [[99.0, 99]] * 2 + [[2.0, 2]] * 2, [[99.0, 99]] * 4]
     said = prediction((truth + torch.tensor(off).double()).tolist(), 2.0, [3.0, 1.0, -1.0])
-    return said, Batch(torch.zeros(3, 3, 0, 0), truth, visible, torch.tensor([2.0, 4.0, 1.0]))
+    return said, Batch(
+        torch.zeros(3, 3, 0, 0), truth, visible, torch.full((3, 4), torch.nan), torch.tensor([2.0, 4.0, 1.0])
+    )
 
 
 def test_figures_are_those_of_what_is_visible():
@@ -477,6 +479,30 @@ def test_learning_the_covariance_leaves_the_means_as_they_are(recipe, scenes, tm
         assert torch.equal(before.attention, after.attention)
         assert (before.sigma_px != after.sigma_px).all()
         assert (before.factor != after.factor).any()
+
+
+def test_learning_to_search_leaves_the_rest_as_it_is(recipe, scenes, done, tmp_path):
+    start = str(done[0] / "best.pt")
+    changes = {
+        "start": start,
+        "learn": "where",
+        "crop": "tile",
+        "covariance": "keypoint",
+        "steps": 3,
+        "validate_every": 1,
+    }
+    train(changed(recipe, tmp_path / "where", **changes))
+    before, after = (load_checkpoint(path) for path in (start, tmp_path / "where" / "last.pt"))
+    old, new = network_weights(before), network_weights(after)
+    for name in old:
+        assert torch.equal(old[name], new[name]), name
+    assert {name.partition(".")[0] for name in set(new) - set(old)} == {"where"}
+    figures = after["history"][-1]
+    assert figures["median_px"] == before["history"][-1]["median_px"]  # of the corners, as they were
+    assert 0 <= figures["where_found"] <= 1
+    assert figures["where_loss"] < after["history"][0]["where_loss"]
+    again = train(changed(recipe, tmp_path / "where", **changes))  # from its end
+    assert again["where_loss"] == min(row["where_loss"] for row in after["history"])
 
 
 def test_the_average_forgets_as_told(recipe, scenes, tmp_path):

@@ -7,6 +7,7 @@ windows count from pixel edges (`PixelWindow`), which lie half a pixel further.
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +16,7 @@ from shortfinal.errors import InputError
 from shortfinal.geometry import PixelWindow, as_array
 
 Array = NDArray[np.float64]
+Crop = Literal["framed", "native", "tile"]  # ways to cut training pictures: data/augment.py
 
 
 def box_around(px: ArrayLike) -> Array:
@@ -105,6 +107,26 @@ def random_margin(box: ArrayLike, image_size: tuple[int, int], rng: np.random.Ge
     if most > 1.9 and rng.random() < 0.25:
         return float(np.exp(rng.uniform(np.log(1.9), np.log(min(most, 8.0)))))
     return float(rng.uniform(1.15, max(1.2, min(1.9, most))))
+
+
+def search_crop(box: Array | None, image_size: tuple[int, int], size: int, rng: np.random.Generator) -> PixelWindow:
+    """A window as the search lays them over a frame (`search.windows_of`), for training.
+
+    A runway's box (4,) is 0.03 to 0.75 of its side (log-uniform), as far as the image (width, height) and twice its
+    resolution allow; three in four hold the box's centre. Without a box: of any scale, anywhere.
+    """
+    largest = 1.15 * max(image_size)
+    smallest = min(size / 2.2, largest)
+    if box is None:
+        side = float(np.exp(rng.uniform(np.log(smallest), np.log(largest))))
+    else:
+        length = float((box[2:] - box[:2]).max())
+        side = float(np.clip(length / np.exp(rng.uniform(np.log(0.03), np.log(0.75))), smallest, largest))
+    if box is not None and rng.random() < 0.75:
+        left, top = (box[:2] + box[2:]) / 2 + 0.5 - rng.uniform(0.05, 0.95, 2) * side
+    else:
+        left, top = (rng.uniform(min(0.0, extent - side), max(0.0, extent - side)) for extent in image_size)
+    return PixelWindow(float(left), float(top), side, side, size, size)
 
 
 def inverse_crop(

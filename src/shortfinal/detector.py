@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -29,6 +29,10 @@ Ints = NDArray[np.int_]
 METADATA_KEY = "shortfinal"
 FORMAT = 2
 OUTPUTS = ("mean_px", "cov_px", "visible", "present")
+# The output of a model that can search, (2, H, W): probability and longer side of a runway's box, px. Made only on
+# request, an optional input: a look at a crop does not pay for it.
+WHERE, SEARCH = "where", "search"
+SPOT = 0.25  # probability of a cell from which on it may hold the centre of a runway
 COVARIANCES = ("diagonal", "keypoint", "full")
 Precision = Literal["fp32", "fp16", "int8"]
 
@@ -115,6 +119,20 @@ class Look:
     present: float  # probability that a runway is
 
 
+class Spot(NamedTuple):
+    """Where in an image a runway may be."""
+
+    probability: float
+    centre_px: tuple[float, float]  # of the runway's box, u and v
+    side_px: float  # of the box, the longer one
+
+    @property
+    def box(self) -> Array:
+        """A square box (4,) around it: left, top, right, bottom."""
+        half, centre = self.side_px / 2, np.array(self.centre_px)
+        return np.concatenate([centre - half, centre + half])
+
+
 class KeypointDetector:
     """A model file, loaded. `look` turns an image and a window of it into keypoints in the image's pixels."""
 
@@ -144,6 +162,31 @@ class KeypointDetector:
 
     def look_all(self, image: Image, windows: Sequence[PixelWindow]) -> list[Look]:
         """What it sees within several windows of one image, from one call of the network; as `look`."""
+        answers = self._run(image, windows, OUTPUTS)
+        return [self._look(window, *answer) for window, *answer in zip(windows, *answers, strict=True)]
+
+    @property
+    def searches(self) -> bool:
+        """Whether the model says where runways are (`spots`)."""
+        return any(output.name == WHERE for output in self._session.get_outputs())
+
+    def spots(self, image: Image, windows: Sequence[PixelWindow]) -> list[Spot]:
+        """Where in several windows of an image there may be runways, of any size; likeliest first. One call of the
+        network. The same runway may be seen in several windows.
+
+        Raises InputError as `look`, and for a model that cannot search.
+        """
+        if not self.searches:
+            raise InputError("the model does not say where runways are: train it with learn = where, or pass a box")
+        found: list[Spot] = []
+        for window, (share, side) in zip(windows, *self._run(image, windows, (WHERE,)), strict=True):
+            if not (np.isfinite(share).all() and np.isfinite(side).all()):
+                raise InputError("the model's answer where runways are is not finite")
+            found += _spots(window, share, side)
+        return sorted(found, reverse=True)
+
+    def _run(self, image: Image, windows: Sequence[PixelWindow], outputs: Sequence[str]) -> list[Any]:
+        """Those outputs of the network (B, ...) for several windows of an image."""
         check_image(image)
         info = self.info
         batch = np.empty((len(windows), 3, info.size, info.size), np.float32)
@@ -154,12 +197,13 @@ class KeypointDetector:
                 )
             normalise(crop_image(image, window), info.mean, info.std, out=pixels)
         if not windows:
-            return []
+            return [[] for _ in outputs]
         try:
-            answers = self._session.run(OUTPUTS, {"image": batch})
+            asked = {SEARCH: np.array(True)} if WHERE in outputs else {}
+            answers: list[Any] = self._session.run(outputs, {"image": batch, **asked})
         except Exception as error:  # ONNX Runtime has no common base class for what it raises
             raise InputError(f"the model failed: {str(error).splitlines()[0][:120]}") from error
-        return [self._look(window, *answer) for window, *answer in zip(windows, *answers, strict=True)]
+        return answers
 
     def _look(self, window: PixelWindow, mean: Any, cov: Any, visible: Any, present: Any) -> Look:
         """One answer, float32, in the image's pixels."""
@@ -172,6 +216,22 @@ class KeypointDetector:
             cov *= self._gain
         keypoints = GaussianKeypoints(window.inverse(mean), window.inverse_cov(cov))
         return Look(window, keypoints, frozen(probabilities[:-1]), float(present))
+
+
+def _spots(window: PixelWindow, share: Any, side: Any) -> list[Spot]:
+    """The peaks of one window's answer (H, W), in the image's pixels."""
+    peaks = (share >= SPOT) & (share == cv2.dilate(share, np.ones((3, 3), np.uint8)))
+    rows, columns = share.shape
+    found = []
+    for row, column in np.argwhere(peaks):
+        near = np.s_[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        weight = share[near].astype(np.float64)
+        # The cell alone would leave it half a cell off.
+        v, u = ((n[near] * weight).sum() / weight.sum() + 0.5 for n in np.indices(share.shape, float))
+        cell = np.array([window.out_width / columns, window.out_height / rows])
+        u, v = (float(n) for n in window.inverse(np.array([u, v]) * cell - 0.5))
+        found.append(Spot(float(share[row, column]), (u, v), float(side[row, column] / window.scale[0])))
+    return found
 
 
 def check_image(image: Image) -> None:
@@ -280,7 +340,9 @@ def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo]:
     k = len(info.keypoints)
     outputs = {out.name: tuple(out.shape[1:]) for out in session.get_outputs()}
     wanted = dict(zip(OUTPUTS, ((k, 2), (2 * k, 2 * k), (k,), ()), strict=True))
-    if shape != (3, info.size, info.size) or any(outputs.get(name) != wanted[name] for name in OUTPUTS):
+    on_request = {given.name for given in session.get_overridable_initializers()}
+    fits = all(outputs.get(name) == wanted[name] for name in OUTPUTS) and (WHERE in outputs) == (SEARCH in on_request)
+    if shape != (3, info.size, info.size) or not fits:
         given = ", ".join(f"{name} {sizes}" for name, sizes in outputs.items())
         raise InputError(f"{source}: it takes {shape} and gives {given}, unlike its description; export it again")
     return session, info

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shortfinal.crops import box_around, centre_crop
-from shortfinal.detector import Image, KeypointDetector, Look, check_image, crop_image
+from shortfinal.detector import Image, KeypointDetector, Look, Spot, check_image, crop_image
 from shortfinal.errors import InputError
 from shortfinal.geometry import Camera, PixelWindow, Pose, as_array, project
 from shortfinal.integrity import FALSE_ALARM_RATE, Decision, IntegrityVerdict, check_integrity, check_rate
@@ -20,6 +21,7 @@ from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
 from shortfinal.pose import PoseEstimate, estimate_pose
 from shortfinal.protection import FAULT_PRIOR, INTEGRITY_RISK, ProtectionLevels, protection_levels
 from shortfinal.runway import Runway
+from shortfinal.search import Search, distinct, windows_around
 from shortfinal.tracker import Track, Tracker, TrackState
 from shortfinal.window import RelativeMotion
 
@@ -27,6 +29,11 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 WIDE_MARGIN = 1.9  # of the first crop around a prior pose: the widest that training uses
+SPOT_MARGIN = 2.2  # of the first crop where a search found something: its place and size are rough
+# What a search finds is a runway if its presence is as probable as SURE, each corner as SURE_OF_CORNER, and no
+# coordinate's sigma exceeds the share SHARP of the longer side of its box (benchmarks/search.py, docs/search.md).
+SURE, SURE_OF_CORNER, SHARP = 0.99, 0.9, 0.1
+FOLLOWED = 6  # spots of a frame, at most, that are looked at closely
 LOOKS = 3  # crops at most, for a frame
 PRESENT = 0.5  # probability of a runway below which there is none, and of a corner below which it is not seen
 ENDS = (slice(0, 2), slice(2, 4))  # the keypoints of the near end and of the far one
@@ -88,11 +95,11 @@ class FrameResult:
 
 
 class LandingPipeline:
-    """Crop, detect, solve, doubt, track: one runway, one camera, frame after frame.
+    """Find, crop, detect, solve, doubt, track: one runway, one camera, frame after frame.
 
-    Where to look comes with each frame: a box around the runway, or a prior pose (GNSS/INS), or
-    else the track's prediction, or the last frame whose pose was accepted. Frames must be of the
-    camera's size.
+    Where to look comes with the frame, a box around the runway or a prior pose (GNSS/INS), or else from the
+    track's prediction, or the last frame whose pose was accepted. Without any of these the frame is searched,
+    a part of it with each. Frames must be of the camera's size.
     """
 
     def __init__(
@@ -129,6 +136,7 @@ class LandingPipeline:
         self.false_alarm_rate, self.integrity_risk, self.fault_prior = false_alarm_rate, integrity_risk, fault_prior
         self.tracker = tracker
         self._last: Pose | None = None
+        self._search = Search(camera.width, camera.height, detector.info.size) if detector.searches else None
 
     def step(
         self,
@@ -173,15 +181,71 @@ class LandingPipeline:
         return replace(result, track=track)
 
     def _seen(self, frame_rgb: Image, timestamp_s: float, box: ArrayLike | None, prior: Pose | None) -> FrameResult:
+        near = prior or self._expected(timestamp_s)
+        if box is None and near is None and self._search is not None:
+            return self._found(frame_rgb, timestamp_s, self._search)
         timings: dict[str, float] = {}
         try:
-            near = prior or self._expected(timestamp_s)
             wide = None if box is not None else WIDE_MARGIN
             sight = _timed(
                 timings, "detect_ms", lambda: see(self.detector, frame_rgb, self._first_box(box, near), wide)
             )
         except InputError as error:
+            self._last = None
             return FrameResult(timestamp_s, None, None, None, self._not_monitored(str(error)), None, timings)
+        if sight.obstacle:
+            self._last = None  # it is not where it was: the next frame is searched
+        return self._judged(sight, timestamp_s, timings)
+
+    def _found(self, frame_rgb: Image, timestamp_s: float, search: Search) -> FrameResult:
+        """A frame of which nothing is known: what of the runway is found in the part of it whose turn it is."""
+        timings: dict[str, float] = {}
+        try:
+            spots = _timed(timings, "search_ms", lambda: search.look(self.detector, frame_rgb))
+            sights = _timed(timings, "detect_ms", lambda: self._settled(frame_rgb, spots))
+        except InputError as error:
+            return FrameResult(timestamp_s, None, None, None, self._not_monitored(str(error)), None, timings)
+        results = [self._judged(sight, timestamp_s, timings) for sight in sights]
+        fitting = self._chosen([result for result in results if result.verdict.decision is Decision.USE])
+        self._last = None
+        if len(fitting) == 1:
+            search.again()
+            assert fitting[0].estimate is not None  # as it may be used
+            self._last = fitting[0].estimate.pose
+            return fitting[0]
+        reason = f"searching for the runway: {search.progress}, none found"
+        if results:  # a pattern of fields can pass for a runway, but hardly for this one
+            reason += f" that fits; one does not: {'; '.join(results[0].verdict.reasons)}"
+        if fitting:
+            reason = (
+                f"{len(fitting)} runways in view fit, and which is meant is not known: pass a box or a prior pose, or "
+                "call the runway by its name with L, C or R"
+            )
+        return FrameResult(timestamp_s, None, None, None, self._not_monitored(reason), None, timings)
+
+    def _settled(self, frame_rgb: Image, spots: list[Spot]) -> list[Sight]:
+        """The runways that are at those spots, and beside them: each settled, nothing in its way."""
+        sights: list[Sight] = []
+        ahead, followed = list(spots), 0
+        while ahead and followed < FOLLOWED:
+            sight, followed = _sight_at(self.detector, frame_rgb, ahead.pop(0)), followed + 1
+            if sight is None or any(_same(sight, other) for other in sights):
+                continue
+            if not sights:
+                around = windows_around(Spot(1.0, *_place(sight)), self.detector.info.size)
+                ahead = distinct([*ahead, *self.detector.spots(frame_rgb, around)])
+            sights.append(sight)
+        return sights
+
+    def _chosen(self, fitting: list[FrameResult]) -> list[FrameResult]:
+        """Of several runways side by side the one that the runway's name means: 24L, 24C, 24R; else all."""
+        named = re.search(r"\d([LCR])$", self.runway.ident)
+        if named is None or len(fitting) < 2 or (named[1] == "C" and len(fitting) != 3):
+            return fitting
+        across = sorted(fitting, key=lambda result: 0.0 if result.crop is None else result.crop.left)
+        return [across[{"L": 0, "C": 1, "R": -1}[named[1]]]]
+
+    def _judged(self, sight: Sight, timestamp_s: float, timings: dict[str, float]) -> FrameResult:
         seen = (sight.look.present, sight.end_crops, *self._bounds(sight))
         crop, keypoints = sight.look.window, sight.keypoints.only(sight.seen)
         if sight.obstacle:
@@ -236,7 +300,10 @@ class LandingPipeline:
     def _first_box(self, box: ArrayLike | None, near: Pose | None) -> Array:
         if box is None:
             if near is None:
-                raise InputError("where to look is not known: no box, no prior pose, and no earlier frame was accepted")
+                raise InputError(
+                    "where to look is not known: no box, no prior pose, no earlier frame was accepted, and the model "
+                    "cannot search"
+                )
             box = box_around(project(self.camera, near, self.runway.corners))
         bounds = as_array(box, (4,), "box")
         if (bounds[2:] < 0).any() or bounds[0] >= self.camera.width or bounds[1] >= self.camera.height:
@@ -283,6 +350,34 @@ def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float 
         return Sight(look, look.keypoints, f"the runway does not settle inside the crop in {LOOKS} looks")
     keypoints, end_crops = _sharpened(detector, frame, look)
     return Sight(look, keypoints, _cut_off(keypoints, frame.shape[1], frame.shape[0]), end_crops)
+
+
+def _sight_at(detector: KeypointDetector, frame: Image, spot: Spot) -> Sight | None:
+    """What is seen at a spot of a search; None unless it is a runway for certain.
+
+    The network names four corners of a field, too, but it is not sure where they are: by its own sigma, less than
+    by what it makes of the picture as a whole, what is a runway is told from what is not.
+    """
+    try:
+        sight = see(detector, frame, spot.box, SPOT_MARGIN)
+    except InputError:  # a place of no use
+        return None
+    _, length = _place(sight)
+    vague = float(sight.keypoints.sigma_px[:4].max()) > SHARP * length
+    doubtful = sight.look.present < SURE or sight.look.visible[:4].min() < SURE_OF_CORNER
+    return None if sight.obstacle or vague or doubtful else sight
+
+
+def _place(sight: Sight) -> tuple[tuple[float, float], float]:
+    """Where a runway is, as a `Spot` says it: the centre of its box, px, and the longer side."""
+    box = box_around(sight.keypoints.mean_px[:4])
+    return (float(box[0] + box[2]) / 2, float(box[1] + box[3]) / 2), float((box[2:] - box[:2]).max())
+
+
+def _same(one: Sight, other: Sight) -> bool:
+    """Whether two sights are of one runway: the centres of their boxes within half a box of one another."""
+    (centre, length), (place, size) = _place(one), _place(other)
+    return math.dist(centre, place) < max(length, size) / 2
 
 
 def _sharpened(

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shortfinal.crops import bogo_crop, box_around, inverse_crop, native_crop, random_margin
+from shortfinal.crops import Crop, bogo_crop, box_around, inverse_crop, native_crop, random_margin, search_crop
 from shortfinal.data.dataset import Example
 from shortfinal.detector import warp_image
 from shortfinal.geometry import PixelWindow
@@ -137,21 +137,25 @@ def _somewhere(image_size: tuple[int, int], rng: np.random.Generator) -> Array:
 
 
 def augmented_crop(
-    example: Example, size: int, rng: np.random.Generator, *, native: bool = False, weather: bool = True
+    example: Example, size: int, rng: np.random.Generator, *, kind: Crop = "framed", weather: bool = True
 ) -> tuple[Image, Array]:
     """A random crop (size, size, 3) of an example as another camera in other weather saw it; its keypoints (K, 2).
 
     Keypoints beyond the crop are given too; those that are not in the picture, or not labelled, are NaN:
     a crop that hangs over its border shows none of them. The camera works at the image's resolution, or
     the crop's where that is coarser: its noise and its JPEG blocks are enlarged with the picture, as in
-    use. `native`: the paper's crop, of whole runways only; without `weather` the picture is only cut.
+    use. `kind`: "framed" (`random_warp`); "native", the paper's crop, of whole runways only; "tile", as the search
+    looks at a frame. Without `weather` the picture is only cut.
     """
     height, width = example.image.shape[:2]
     places = within(example)
     corners = places[:4]  # which frame the crop
     whole = bool(np.isfinite(corners).all())
     beside = None
-    if native and whole:
+    if kind == "tile":
+        box = box_around(corners) if whole else None
+        warp = _warp(search_crop(box, (width, height), size, rng), _STILL, cv2.BORDER_CONSTANT, rng)
+    elif kind == "native" and whole:
         warp = native_warp(corners, (width, height), size, rng)
     else:
         if whole and rng.random() < ELSEWHERE:

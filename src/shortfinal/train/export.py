@@ -18,12 +18,22 @@ import onnx_ir
 import onnxruntime
 import torch
 from numpy.typing import NDArray
-from onnx import ModelProto, NodeProto
+from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from shortfinal.calibrate import framed
 from shortfinal.data.dataset import read_dataset
-from shortfinal.detector import FORMAT, OUTPUTS, ModelInfo, Precision, crop_image, described, normalise
+from shortfinal.detector import (
+    FORMAT,
+    OUTPUTS,
+    SEARCH,
+    WHERE,
+    ModelInfo,
+    Precision,
+    crop_image,
+    described,
+    normalise,
+)
 from shortfinal.errors import InputError, JobError
 from shortfinal.files import write_whole
 from shortfinal.train.fit import load_checkpoint, network_of, network_weights
@@ -69,10 +79,20 @@ class Network(nn.Module):
         super().__init__()
         self.net = net
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Pictures (B, 3, S, S) to the file's outputs: (B, K, 2), (B, 2K, 2K), (B, K) and (B,)."""
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The names of what it gives."""
+        return OUTPUTS if self.net.where is None else (*OUTPUTS, WHERE)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
+        """Pictures (B, 3, S, S) to the file's outputs: (B, K, 2), (B, 2K, 2K), (B, K), (B,) and, if the network says
+        where runways are, (B, 2, H, W): the probability that a box's centre is in a cell, and its longer side, px.
+        """
         told = self.net(image)
-        return told.mean_px, told.cov_px, told.visible.sigmoid(), told.present.sigmoid()
+        answer = (told.mean_px, told.cov_px, told.visible.sigmoid(), told.present.sigmoid())
+        if told.where is None:
+            return answer
+        return (*answer, torch.stack([told.where[:, 0].sigmoid(), told.where[:, 1].clamp(0, 7).exp()], dim=1))
 
 
 def load_network(checkpoint: str | Path) -> tuple[Network, dict[str, Any]]:
@@ -112,8 +132,9 @@ def export(
     if precision == "int8":
         model, difference, share = _quantised(model, network, pictures[::2], pictures[1::2])
         info.figures["int8_share"] = share
+        model = _on_request(model)
     else:
-        model = model if precision == "fp32" else _halved(model)
+        model = _on_request(model if precision == "fp32" else _halved(model))
         difference = compare(model, pictures, answers_of(network, pictures))
     if not difference.within(LIMITS[precision]):
         raise JobError(
@@ -143,11 +164,47 @@ def to_onnx(network: Network, size: int) -> ModelProto:
     """The network in float32, for any number of pictures; its nodes still say of which module they are."""
     batch = torch.export.Dim("batch", min=1, max=4096)
     program = torch.onnx.export(
-        network, (torch.zeros(2, 3, size, size),), input_names=["image"], output_names=list(OUTPUTS), dynamo=True,
-        dynamic_shapes={"image": {0: batch}}, verbose=False,
+        network, (torch.zeros(2, 3, size, size),), input_names=["image"], output_names=list(network.outputs),
+        dynamo=True, dynamic_shapes={"image": {0: batch}}, verbose=False,
     )  # fmt: skip
     assert program is not None
     return program.model_proto
+
+
+def _on_request(model: ModelProto) -> ModelProto:
+    """With all that only WHERE needs under a condition, the optional input SEARCH, which is false if not given."""
+    if WHERE not in {output.name for output in model.graph.output}:
+        return model
+    needed, others = set(OUTPUTS), list[NodeProto]()
+    for node in reversed(model.graph.node):
+        if needed & set(node.output):
+            needed |= set(node.input)
+        else:
+            others.insert(0, node)
+    conditional = ModelProto()
+    conditional.CopyFrom(model)
+    graph = conditional.graph
+    kept = [node for node in graph.node if needed & set(node.output)]
+    del graph.node[:]
+    graph.node.extend(kept)
+    for node in others:
+        node.output[:] = [f"{name}.asked" if name == WHERE else name for name in node.output]
+    told = helper.make_tensor_value_info(f"{WHERE}.asked", TensorProto.FLOAT, None)
+    untold = numpy_helper.from_array(np.zeros((1, 2, 0, 0), np.float32), f"{WHERE}.unasked")
+    nothing = helper.make_node("Constant", [], [untold.name], value=untold)
+    graph.node.append(
+        helper.make_node(
+            "If", [SEARCH], [WHERE], then_branch=helper.make_graph(others, "asked", [], [told]),
+            else_branch=helper.make_graph(
+                [nothing], "unasked", [], [helper.make_tensor_value_info(untold.name, TensorProto.FLOAT, None)]
+            ),
+        )
+    )  # fmt: skip
+    declared = next(output for output in graph.output if output.name == WHERE)
+    declared.CopyFrom(helper.make_tensor_value_info(WHERE, TensorProto.FLOAT, ["batch", 2, "rows", "columns"]))
+    graph.input.append(helper.make_tensor_value_info(SEARCH, TensorProto.BOOL, []))
+    graph.initializer.append(numpy_helper.from_array(np.array(False), SEARCH))
+    return conditional
 
 
 def _stripped(model: ModelProto) -> ModelProto:
@@ -180,7 +237,7 @@ def _crops(data: str | Path, info: ModelInfo) -> Pictures:
 
 
 def answers_of(network: Network, pictures: Pictures) -> list[Array]:
-    """What torch answers: the arrays of OUTPUTS."""
+    """What torch answers: the arrays of its outputs."""
     with torch.inference_mode():
         answers = [network(torch.from_numpy(batch)) for batch in _batches(pictures)]
     return [torch.cat(parts).double().numpy() for parts in zip(*answers, strict=True)]
@@ -189,9 +246,12 @@ def answers_of(network: Network, pictures: Pictures) -> list[Array]:
 def compare(model: ModelProto, pictures: Pictures, wanted: list[Array]) -> Difference:
     """How far ONNX Runtime's answers are from those `wanted` (`answers_of`)."""
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    answers = [session.run(OUTPUTS, {"image": batch}) for batch in _batches(pictures)]
+    asked = {given.name: np.array(True) for given in session.get_overridable_initializers() if given.name == SEARCH}
+    answers = [session.run(None, {"image": batch, **asked}) for batch in _batches(pictures)]
     mean, cov, *scope = (np.concatenate(parts).astype(np.float64) for parts in zip(*answers, strict=True))
     true_mean, true_cov, *true_scope = wanted
+    if len(scope) > len(OUTPUTS) - 2:  # where: lengths count as far as there is a runway
+        scope[-1], true_scope[-1] = _weighed(scope[-1], true_scope[-1]), _weighed(true_scope[-1], true_scope[-1])
     sigma, correlation = _split(cov)
     true_sigma, true_correlation = _split(true_cov)
     return Difference(
@@ -199,6 +259,11 @@ def compare(model: ModelProto, pictures: Pictures, wanted: list[Array]) -> Diffe
         max(_rms(sigma / true_sigma - 1), _rms(correlation - true_correlation)),
         max(_rms(mine - true) for mine, true in zip(scope, true_scope, strict=True)),
     )
+
+
+def _weighed(where: Array, true: Array) -> Array:
+    """Probabilities, and logarithms of lengths by the true probabilities, (N, 2, H, W)."""
+    return np.stack([where[:, 0], np.log(where[:, 1]) * true[:, 0]], axis=1)
 
 
 def _split(cov: Array) -> tuple[Array, Array]:
@@ -244,7 +309,7 @@ def _halved(model: ModelProto) -> ModelProto:
     in_order = onnx_ir.from_proto(low)
     in_order.graph.sort()
     low = compose.add_prefix(onnx_ir.to_proto(in_order), "backbone.", rename_inputs=False)
-    high = parts.extract_model(maps, list(OUTPUTS))
+    high = parts.extract_model(maps, [output.name for output in model.graph.output])
     return compose.merge_models(low, high, io_map=[(f"backbone.{name}", name) for name in maps])
 
 

@@ -22,7 +22,7 @@ from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, Dataset
 
 from shortfinal.calibration import LEVELS, coverage
-from shortfinal.crops import box_around, centre_crop, native_crop
+from shortfinal.crops import box_around, centre_crop, native_crop, search_crop
 from shortfinal.data.augment import augmented_crop, inside, within
 from shortfinal.data.dataset import Example, LabelledDataset, read_dataset
 from shortfinal.data.formats import split_by_airport
@@ -30,7 +30,7 @@ from shortfinal.detector import crop_image, normalise
 from shortfinal.errors import InputError, JobError
 from shortfinal.files import csv_text, make_folder, write_whole
 from shortfinal.geometry import PixelWindow
-from shortfinal.train.loss import attention_loss, gaussian_nll, scope_loss
+from shortfinal.train.loss import attention_loss, gaussian_nll, scope_loss, where_loss
 from shortfinal.train.model import KeypointNet, Prediction
 from shortfinal.train.recipe import Recipe, to_dict
 from shortfinal.train.weights import FOLDED_MEAN, FOLDED_STD, first_line, load_weights, reading
@@ -44,6 +44,7 @@ class Batch(NamedTuple):
     image: Tensor  # (B, 3, S, S)
     corners_px: Tensor  # (B, K, 2); anything where not visible
     visible: Tensor  # (B, K) 0 or 1: labelled, and in the picture and the crop
+    box_px: Tensor  # (B, 4) left, top, right, bottom around the corners, also beyond the crop; NaN: not in the picture
     scale: Tensor  # (B,) pixels of the crop per pixel of the picture
 
     def to(self, device: Any) -> Batch:
@@ -71,8 +72,7 @@ class _Draws(Dataset[Batch]):
         number = self.steps[step] * recipe.batch + self.rank * self.share + place
         rng = np.random.default_rng([recipe.seed, 1, number])
         example = self.examples[self._pick(number)]
-        native = recipe.crop == "native"
-        crop, corners = augmented_crop(example, recipe.size, rng, native=native, weather=recipe.weather)
+        crop, corners = augmented_crop(example, recipe.size, rng, kind=recipe.crop, weather=recipe.weather)
         return _labelled(crop, corners, 1.0, recipe)
 
     def _pick(self, number: int) -> int:
@@ -85,7 +85,7 @@ class _Draws(Dataset[Batch]):
 
 
 class _Held(Dataset[Batch]):
-    """The held-out pictures, or so many of them from beginning to end: framed at the centre, or the paper's crop."""
+    """The held-out pictures, or so many of them from beginning to end: framed at the centre, or as the recipe crops."""
 
     def __init__(self, examples: LabelledDataset, recipe: Recipe) -> None:
         self.examples, self.recipe = examples, recipe
@@ -106,6 +106,9 @@ def held_out_window(example: Example, recipe: Recipe, index: int) -> PixelWindow
     height, width = example.image.shape[:2]
     corners = within(example)[:4]
     seen = corners[np.isfinite(corners).all(axis=1)]
+    if recipe.crop == "tile":
+        rng = np.random.default_rng([recipe.seed, 2, index])
+        return search_crop(box_around(seen) if len(seen) == 4 else None, (width, height), recipe.size, rng)
     if len(seen) < 2:
         return PixelWindow.resize(width, height, recipe.size, recipe.size)
     if recipe.crop == "native" and len(seen) == 4:
@@ -120,8 +123,14 @@ def _labelled(crop: np.ndarray[Any, Any], corners: np.ndarray[Any, Any], scale: 
     places = np.where(visible[:, None], corners, 0.0).astype(np.float32)
     return Batch(
         torch.from_numpy(normalise(crop, mean, std)), torch.from_numpy(places),
-        torch.from_numpy(visible.astype(np.float32)), torch.tensor(scale, dtype=torch.float32),
+        torch.from_numpy(visible.astype(np.float32)), torch.from_numpy(_box(corners)),
+        torch.tensor(scale, dtype=torch.float32),
     )  # fmt: skip
+
+
+def _box(corners: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    whole = bool(np.isfinite(corners[:4]).all())
+    return (box_around(corners[:4]) if whole else np.full(4, np.nan)).astype(np.float32)
 
 
 def open_data(recipe: Recipe) -> tuple[LabelledDataset, LabelledDataset]:
@@ -201,6 +210,20 @@ def figures_of(prediction: Prediction, batch: Batch) -> dict[str, float]:
     return figures
 
 
+def where_figures(where: Tensor, batch: Batch, size: int) -> dict[str, float]:
+    """What the search's part makes of held-out tiles (B, 2, H, W): its loss, and the share of runways, 8 pixels long
+    or more and with their box's centre in the tile, that its highest cell is within a cell of.
+    """
+    loss = where_loss(where, batch.box_px, batch.visible, size)
+    width = where.shape[-1]
+    cell, best = size / width, where[:, 0].flatten(1).argmax(dim=1)
+    place = torch.stack([best % width, best // width], dim=1) * cell + cell / 2 - 0.5
+    centre, side = (batch.box_px[:, :2] + batch.box_px[:, 2:]) / 2, batch.box_px[:, 2:] - batch.box_px[:, :2]
+    inside_ = ((centre > 0) & (centre < size - 1)).all(dim=1) & (side.amax(dim=1) >= 8)
+    near = ((place - centre).abs() <= 1.5 * cell).all(dim=1)
+    return {"where_loss": float(loss.mean()), "where_found": float(near[inside_].float().mean())}
+
+
 def auroc(scores: np.ndarray[Any, Any], positive: np.ndarray[Any, Any]) -> float:
     """Chance that a positive scores above a negative, ties counted half (Mann and Whitney)."""
     from scipy.stats import rankdata
@@ -242,14 +265,26 @@ class Run:
         fresh = not (recipe.start or (self.folder / "last.pt").exists())
         self.net = _network(recipe, pretrained=fresh and recipe.weights == "timm")
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        if recipe.learn == "covariance":
-            for part in self.net.means:
-                part.requires_grad_(False)
+        for part in self.kept:
+            part.requires_grad_(False)
         optimizer = _optimizer(recipe, self.net)
         self.schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(recipe, step / self.steps))
         self.model, self.optimizer = self.fabric.setup(self.net, optimizer)
         self.average = AveragedModel(self.net, multi_avg_fn=_averaging(recipe.ema), use_buffers=True)
         self.step, self.history = 0, list[dict[str, float]]()
+        self.figures: dict[str, float] = {}  # of the checkpoint it began from, where they stay as they are
+
+    @property
+    def kept(self) -> list[torch.nn.Module]:
+        """The parts of the network that do not learn."""
+        if self.recipe.learn == "where":
+            return [part for name, part in self.net.named_children() if name != "where"]
+        return self.net.means if self.recipe.learn == "covariance" else []
+
+    @property
+    def goal(self) -> str:
+        """The figure that tells which network is the best."""
+        return "where_loss" if self.recipe.learn == "where" else "nll"
 
     def save(self, name: str) -> None:
         """Write a checkpoint whole or not at all."""
@@ -274,6 +309,7 @@ class Run:
             getattr(self, part).load_state_dict(state[part])
         self.fabric.strategy.precision.load_state_dict(state.get("precision", {}))
         self.step, self.history = state["step"], state["history"]
+        self.figures = _corner_figures(state)
         return True
 
     def begin(self, pictures: Callable[[], Tensor]) -> None:
@@ -285,11 +321,12 @@ class Run:
             was, now = state["recipe"], to_dict(recipe)
             differ = [name for name in ("backbone", "head", "features", "mean", "std") if was[name] != now[name]]
             differ += [k for k, v in weights.items() if k not in mine or mine[k].shape != v.shape]
-            # One that had no correlations may become one that has.
-            differ += [k for k in mine if k not in weights and not k.startswith("correlation.")]
+            # One that had no correlations, or did not say where, may become one that does.
+            differ += [k for k in mine if k not in weights and not k.startswith(("correlation.", "where."))]
             if differ:
                 raise InputError(f"{recipe.start}: of another network ({differ[0]} differs)")
             self.net.load_state_dict(weights, strict=False)
+            self.figures = _corner_figures(state)
         elif recipe.weights not in ("", "timm"):
             if recipe.weights.endswith(".npz") and (recipe.mean, recipe.std) != (FOLDED_MEAN, FOLDED_STD):
                 raise InputError(f"{recipe.weights}: needs mean = {list(FOLDED_MEAN)} and std = {list(FOLDED_STD)}")
@@ -300,6 +337,8 @@ class Run:
         """What this step minimises: a mean over the batch's pictures, so that processes can share it."""
         recipe = self.recipe
         prediction = self.model(batch.image)
+        if recipe.learn == "where":
+            return where_loss(prediction.where, batch.box_px, batch.visible, recipe.size).mean()
         error = (prediction.mean_px - batch.corners_px) * batch.visible[..., None]
         coordinates = error[0].numel()
         warming = self.step < recipe.warm_up * self.steps
@@ -317,9 +356,8 @@ class Run:
     def advance(self, batch: Batch) -> float:
         """One step of the optimiser; returns the loss over all processes."""
         self.model.train()
-        if self.recipe.learn == "covariance":
-            for part in self.net.means:
-                part.eval()
+        for part in self.kept:
+            part.eval()
         loss = self.loss(batch.to(self.fabric.device))
         value = float(self.fabric.all_reduce(loss.detach(), reduce_op="mean"))  # type: ignore[arg-type]
         if not math.isfinite(value):
@@ -336,11 +374,11 @@ class Run:
 
     def record(self, figures: dict[str, float]) -> None:
         """Keep a validation: last.pt always, best.pt if it is the best yet, and the table of all."""
-        best = min((row["nll"] for row in self.history), default=math.inf)
+        best = min((row[self.goal] for row in self.history), default=math.inf)
         self.history.append(figures)
         self.fabric.log_dict(figures, step=self.step)
         self.board.experiment.flush()
-        if figures["nll"] < best:
+        if figures[self.goal] < best:
             self.save("best.pt")
         write_whole(self.folder / "log.csv", csv_text(figures, self.history))
         self.save("last.pt")  # last of all: what is lost by a kill before it is done again, not twice
@@ -350,7 +388,7 @@ def network_of(recipe: Mapping[str, Any], *, pretrained: bool = False) -> Keypoi
     """The network that a recipe's plain values (`to_dict`, or a checkpoint's) describe."""
     return KeypointNet(
         recipe["backbone"], len(recipe["keypoints"]), recipe["head"], recipe["covariance"], recipe["features"],
-        recipe["width"], pretrained=pretrained,
+        recipe["width"], pretrained=pretrained, where=recipe["learn"] == "where",
     )  # fmt: skip
 
 
@@ -420,6 +458,11 @@ def network_weights(state: dict[str, Any]) -> dict[str, Tensor]:
     return {k.removeprefix("module."): v for k, v in state["average"].items() if k.startswith("module.")}
 
 
+def _corner_figures(state: dict[str, Any]) -> dict[str, float]:
+    """What a checkpoint says of its corners."""
+    return {k: v for k, v in state["history"][-1].items() if k not in ("step", "loss") and not k.startswith("where_")}
+
+
 def train(recipe: Recipe, console: Console | None = None) -> dict[str, float]:
     """Train, or go on from the last validation; returns the figures of the best (out/best.pt).
 
@@ -456,7 +499,7 @@ def train(recipe: Recipe, console: Console | None = None) -> dict[str, float]:
         raise InputError(line.removeprefix("shortfinal.errors.InputError: ")) from error
     history = run.fabric.broadcast(run.history)
     run.fabric.barrier()
-    return min(history, key=lambda row: row["nll"])
+    return min(history, key=lambda row: row[run.goal])
 
 
 def leave() -> None:
@@ -484,6 +527,9 @@ def _validate(run: Run, examples: LabelledDataset) -> dict[str, float]:
     prediction, batch = predict(run.average, (batch.to(run.fabric.device) for batch in loader))
     if not (prediction.mean_px.isfinite().all() and prediction.sigma_px.isfinite().all()):
         raise JobError(f"diverged at step {run.step}; lower the learning rate")
+    if run.recipe.learn == "where":
+        assert prediction.where is not None  # as the network has that part
+        return run.figures | where_figures(prediction.where, batch, run.recipe.size)
     return figures_of(prediction, batch)
 
 

@@ -100,6 +100,31 @@ def _bump(place_px: Tensor, size: int, cells: int) -> Tensor:
     return torch.softmax(-0.5 * offset.square(), dim=-1)
 
 
+def where_loss(where: Tensor, box_px: Tensor, visible: Tensor, size: int) -> Tensor:
+    """The loss (B,) of `Prediction.where` (B, 2, H, W): in which cell is the centre of a runway's box, how long is it?
+
+    `box_px` (B, 4): left, top, right, bottom of the runway, also beyond the picture; NaN: none, or not known, if
+    keypoints are `visible` (B, K) all the same: such pictures count nothing. The loss of centres is the focal one of
+    Zhou et al. 2019 (arXiv 1904.07850, eq. 1), with a Gaussian of an eighth of the box around each; of lengths, the
+    absolute error of the logarithm.
+    """
+    height, width = where.shape[-2:]
+    cell = size / width
+    centre, side = (box_px[:, :2] + box_px[:, 2:]) / 2 + 0.5, (box_px[:, 2:] - box_px[:, :2]).amax(dim=1)
+    u, v = ((torch.arange(n, device=where.device) + 0.5) * cell for n in (width, height))
+    across, down = u - centre[:, :1], v - centre[:, 1:]  # (B, W), (B, H)
+    spread = (side / 8).clamp(cell / 2, 2 * cell)[:, None, None]
+    near = torch.exp(-(across.square()[:, None, :] + down.square()[:, :, None]) / (2 * spread.square())).nan_to_num(0.0)
+    here = (across.abs()[:, None, :] <= cell / 2) & (down.abs()[:, :, None] <= cell / 2)
+    logit, length = where.unbind(dim=1)
+    share = logit.sigmoid()
+    found = functional.logsigmoid(logit) * (1 - share).square() * here
+    spared = functional.logsigmoid(-logit) * share.square() * (1 - near) ** 4 * ~here
+    off = (length - side.nan_to_num(1.0).log()[:, None, None]).abs() * here
+    told = box_px.isfinite().all(dim=1) | ~visible.any(dim=1)
+    return (0.3 * off - found - spared).sum(dim=(1, 2)) * told
+
+
 def scope_loss(prediction: Prediction, visible: Tensor) -> Tensor:
     """The loss (B,): is each keypoint in the picture, and is a runway?"""
     present = visible.any(dim=1).to(prediction.present)

@@ -33,6 +33,8 @@ class Prediction(NamedTuple):
     visible: Tensor  # (B, K) logits: this keypoint is in the picture
     present: Tensor  # (B,) logits: a runway is in the picture
     attention: Tensor | None  # (B, K, H, W) logarithm of where each keypoint is looked for; None: the head has none
+    # (B, 2, H, W): logit that the centre of a runway's box is in the cell, and the logarithm of the box's longer side
+    where: Tensor | None = None
 
     @property
     def cov_px(self) -> Tensor:
@@ -53,8 +55,11 @@ class KeypointNet(nn.Module):
     several are fused from deep to shallow with `width` channels, so that the deep ones say which
     corner and the shallow ones say where. `covariance`: sigmas only, or also how the two coordinates
     of a keypoint correlate, or how all 2K do (by the Cholesky factor of the correlation matrix).
+    `where`: also say where in the picture runways are, however small, for the search in whole frames;
+    it looks at the fused map.
 
-    Raises InputError for a backbone timm does not have, or without such feature maps.
+    Raises InputError for a backbone timm does not have, or without such feature maps, and for `where` without
+    a fused map.
     """
 
     def __init__(
@@ -66,6 +71,7 @@ class KeypointNet(nn.Module):
         features: Sequence[int] = (4, 8, 16, 32),
         width: int = 48,
         pretrained: bool = False,
+        where: bool = False,
     ) -> None:
         super().__init__()
         for name, value, known in (("head", head, Head), ("covariance", covariance, Covariance)):
@@ -86,6 +92,9 @@ class KeypointNet(nn.Module):
         self.present = _layers(deep, _HIDDEN, 1)
         linked = _linked(keypoints, covariance)
         self.register_buffer("linked", torch.eye(linked.numel())[linked.flatten()], persistent=False)  # (links, 4K²)
+        if where and (head != "sam" or len(channels) == 1):
+            raise InputError("where: looks at the fused map; it needs the head sam and several features")
+        self.where = Where(width) if where else None
         self.correlation = _layers(told * keypoints, _HIDDEN, int(linked.sum())) if linked.any() else None
 
     def forward(self, image: Tensor) -> Prediction:
@@ -111,8 +120,9 @@ class KeypointNet(nn.Module):
             told, looked = everywhere, None
         spread = torch.stack([layers(told[:, k]) for k, layers in enumerate(self.spread)], dim=1)
         sigma = (spread[..., :2].exp() + MIN_SIGMA_PX**2).sqrt()
+        where = None if self.where is None or fused is None else self.where(fused)
         return Prediction(
-            mean * size - 0.5, sigma, self._factor(told), spread[..., 2], self.present(whole)[:, 0], looked
+            mean * size - 0.5, sigma, self._factor(told), spread[..., 2], self.present(whole)[:, 0], looked, where
         )
 
     @property
@@ -160,6 +170,27 @@ class Neck(nn.Module):
             fused = smooth(here)
         assert fused is not None
         return fused
+
+
+class Where(nn.Module):
+    """The fused map (B, C, H, W) to `Prediction.where` (B, 2, H/2, W/2)."""
+
+    def __init__(self, width: int, hidden: int = 64) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [nn.Conv2d(2 * width, hidden, 1), nn.Hardswish()]
+        for _ in range(2):  # to see more than a runway's own size around it
+            layers += [
+                nn.Conv2d(hidden, hidden, 5, padding=2, groups=hidden), nn.Conv2d(hidden, hidden, 1), nn.Hardswish()
+            ]  # fmt: skip
+        last = nn.Conv2d(hidden, 2, 1)
+        nn.init.constant_(last.bias[:1], -4.0)  # type: ignore[index]  # most cells hold none
+        self.layers = nn.Sequential(*layers, last)
+
+    def forward(self, fused: Tensor) -> Tensor:
+        """See the class."""
+        # The mean forgets what is two pixels wide, the maximum how much of it there is.
+        told: Tensor = self.layers(torch.cat([functional.max_pool2d(fused, 2), functional.avg_pool2d(fused, 2)], dim=1))
+        return told
 
 
 def soft_argmax(attention: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:

@@ -9,16 +9,16 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from shortfinal.crops import Crop
 from shortfinal.errors import InputError
 from shortfinal.files import read_toml
 from shortfinal.keypoints import CORNER_NAMES
 from shortfinal.train.loss import Likelihood
 from shortfinal.train.model import Covariance, Head
 
-Crop = Literal["framed", "native"]
 Optimizer = Literal["adamw", "adam", "rmsprop"]
 Schedule = Literal["cosine", "constant"]
-Learn = Literal["all", "covariance"]
+Learn = Literal["all", "covariance", "where"]
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 
 
@@ -42,12 +42,15 @@ class Recipe:
     std: tuple[float, ...] = (0.25, 0.25, 0.25)
     # pictures
     size: int = 224  # side of the crop, px
-    crop: Crop = "framed"  # of random scale around the runway, as the pipeline looks; "native": as the paper's
+    # Of random scale around the runway, as the pipeline looks; "native": as the paper's; "tile": as it searches.
+    crop: Crop = "framed"
     margin: float = 1.4  # of the framed crop in evaluation; training draws its own (crops.random_margin)
     weather: bool = True  # augment: another camera in other weather
     # loss
     start: str = ""  # a checkpoint whose network to begin from
-    learn: Learn = "all"  # "covariance": backbone and means stay as they are, on pictures they were not trained on
+    # "covariance": backbone and means stay as they are, on pictures they were not trained on; "where": all but the
+    # search's part, which a network that has none gets.
+    learn: Learn = "all"
     likelihood: Likelihood = "half"
     warm_up: float = 0.1  # share of the steps in which the means learn without the variances
     attention_weight: float = 0.3  # of the loss that tells the attention where the corner is; 0: none, as published
@@ -83,8 +86,10 @@ class Recipe:
             raise InputError("steps: at least one step, or epochs, is needed")
         if self.likelihood == "beta" and self.covariance != "diagonal":
             raise InputError(f"likelihood: beta weighs coordinates one by one; covariance {self.covariance} has more")
-        if self.learn == "covariance" and not self.start:
-            raise InputError("learn: covariance needs start, a checkpoint whose means are kept")
+        if self.learn != "all" and not self.start:
+            raise InputError(f"learn: {self.learn} needs start, a checkpoint whose other parts are kept")
+        if (self.learn == "where") != (self.crop == "tile"):
+            raise InputError('learn: where needs crop = "tile", and only it')
 
 
 # The paper's: 30 epochs, 80/20, Adam 5e-4 for ResNets, RMSProp 1e-4 for EfficientNet (arXiv 2508.09732).
