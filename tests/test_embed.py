@@ -311,6 +311,54 @@ def test_what_is_wrong_with_a_call_is_a_status(library):
     assert library.sf_protect(*map(ctypes.byref, (other, problem, estimate, levels))) == bad
 
 
+C_PROGRAM = """
+#include <pthread.h>
+#include <stdio.h>
+#include "shortfinal.h"
+
+static void *fly(void *nothing) {
+    double px[24], cov[576] = {0}, points[36] = {0, 22, 0, 0, -22, 0, 1500, -22, 0, 1500, 22, 0};
+    const double position[3] = {-900, 12, 60}, rotation[9] = {0, 0, 1, -1, 0, 0, 0, -1, 0};
+    sf_camera camera = {.fx = 2000, .fy = 2000, .cx = 479.5, .cy = 359.5};
+    sf_problem seen = {.points = SF_MAX_POINTS, .mean_px = px, .cov_px = cov, .points_m = points, .camera = &camera};
+    static sf_monitor monitor;
+    sf_estimate pose;
+    sf_verdict verdict;
+    sf_levels levels;
+    for (int i = 4; i < SF_MAX_POINTS; ++i) points[3 * i] = 150 * i, points[3 * i + 1] = i % 2 ? 9 : -9;
+    for (int i = 0; i < 24; ++i) cov[25 * i] = 0.25;
+    sf_project(&camera, position, rotation, SF_MAX_POINTS, points, px);
+    sf_monitor_init(&monitor, 2 * SF_MAX_POINTS - 6, 1e-3, 1e-7, 1e-4);
+    sf_estimate_pose(&seen, &pose);
+    sf_check(&monitor, &pose, &verdict);
+    sf_protect(&monitor, &seen, &pose, &levels);
+    printf("%s %s %.6f %d", sf_status_text(pose.status), sf_decision_text(verdict.decision), pose.position_m[0],
+           levels.vertical_m > 0 && levels.vertical_m < 50);
+    return nothing;
+}
+
+int main(void) {
+    pthread_t thread;
+    pthread_attr_t small;
+    pthread_attr_init(&small);
+    pthread_attr_setstacksize(&small, 65536);
+    return pthread_create(&thread, &small, fly, NULL) || pthread_join(thread, NULL);
+}
+"""
+
+
+@pytest.mark.slow
+def test_a_c_program_needs_64_kb_of_stack(library, kernels, tmp_path):
+    program, source = tmp_path / "fly", tmp_path / "fly.c"
+    source.write_text(C_PROGRAM)
+    gcc = shutil.which("gcc") or pytest.skip("no gcc here")
+    folder = kernels.parent
+    words = [gcc, "-std=c11", "-Wall", "-Wextra", "-Werror", "-pedantic", f"-I{EMBED}", source, "-o", program]
+    subprocess.run([*words, f"-L{folder}", "-lshortfinal", f"-Wl,-rpath,{folder}", "-pthread"], check=True)
+    done = subprocess.run([program], capture_output=True, text=True, check=True)
+    assert done.stdout == "converged use -900.000000 1"
+
+
 @pytest.mark.slow
 def test_points_are_projected_where_python_projects_them(library):
     pose = sf.Pose.from_attitude([-900.0, 12.0, 60.0], 2.0, -3.0, 1.0)
@@ -389,7 +437,13 @@ def test_a_frame_lands_as_in_python(landing, number, scale, beside, tmp_path):
 
 @pytest.mark.slow
 def test_what_it_cannot_read_is_named(landing, tmp_path):
+    def refusal(*numbers):
+        words = [landing, shipped_model(), tmp_path / "frame.ppm", *(str(n) for n in numbers)]
+        done = subprocess.run(words, capture_output=True, text=True)
+        assert done.returncode == 2
+        return done.stderr
+
+    assert "no number" in refusal(*[1] * 9, "nan")
+    assert "frame.ppm: no binary PPM" in refusal(*[1] * 10)
     (tmp_path / "frame.ppm").write_bytes(b"P6\n10 10\n255\nshort")
-    words = [landing, shipped_model(), tmp_path / "frame.ppm", *["1"] * 10]
-    done = subprocess.run(words, capture_output=True, text=True)
-    assert (done.returncode, "frame.ppm: cut short" in done.stderr) == (2, True)
+    assert "frame.ppm: cut short" in refusal(*[1] * 10)

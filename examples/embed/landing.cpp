@@ -15,6 +15,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
+#include <cstdlib>
 #include <fstream>
 #include <stdexcept>
 #include <string>
@@ -213,7 +214,7 @@ struct Look {
     Window window{};
     Pixels mean{};      // of the frame
     Covariance cov{};   // likewise, px^2
-    double visible = 0; // of the corners, the least
+    double visible = 0;  // of the corners, the least
     std::array<double, CORNERS> each{};
     double present = 0;
 };
@@ -277,6 +278,11 @@ private:
             for (int c = 0; c < 8; ++c)  // equal to its transpose but for the rounding of float32
                 look.cov[8 * r + c] = 0.5 * (static_cast<double>(cov[8 * r + c]) + cov[8 * c + r]) * gain_[r] * gain_[c] * area;
         }
+        bool finite = present >= 0 && present <= 1;
+        for (double value : look.mean) finite = finite && std::isfinite(value);
+        for (double value : look.cov) finite = finite && std::isfinite(value);
+        for (int i = 0; i < CORNERS; ++i) finite = finite && visible[i] >= 0 && visible[i] <= 1;
+        if (!finite) throw std::runtime_error("the network's answer is no Gaussian");
         std::copy(visible, visible + CORNERS, look.each.begin());
         look.visible = *std::min_element(look.each.begin(), look.each.end());
         look.present = present;
@@ -398,7 +404,13 @@ double milliseconds() {
 
 void run(char **arguments) {
     double n[10];
-    for (int i = 0; i < 10; ++i) n[i] = std::stod(arguments[3 + i]);
+    for (int i = 0; i < 10; ++i) {
+        char *end = nullptr;
+        n[i] = std::strtod(arguments[3 + i], &end);
+        if (*end || !std::isfinite(n[i])) throw std::invalid_argument(std::string(arguments[3 + i]) + ": no number");
+    }
+    if (!(std::min({n[0], n[1], n[4], n[5]}) > 0))
+        throw std::invalid_argument("focal lengths and the runway's size must be positive");
     const sf_camera camera{n[0], n[1], n[2], n[3], {}};
     const double length = n[4], half = n[5] / 2;
     const double corners[12] = {0, half, 0, 0, -half, 0, length, -half, 0, length, half, 0};
@@ -410,7 +422,12 @@ void run(char **arguments) {
 
     const double start = milliseconds();
     std::string obstacle;
-    const Look look = see(network, frame, {n[6], n[7], n[8], n[9]}, obstacle);
+    Look look;
+    try {
+        look = see(network, frame, {n[6], n[7], n[8], n[9]}, obstacle);
+    } catch (const std::runtime_error &error) {  // a frame of no use, and the flight goes on
+        obstacle = error.what();
+    }
     const double seen = milliseconds();
     sf_verdict verdict{SF_NOT_MONITORED, SF_CHECKED, 0, 0, 0, 0};
     sf_estimate estimate{};
