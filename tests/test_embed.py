@@ -328,7 +328,7 @@ static void *fly(void *nothing) {
     for (int i = 4; i < SF_MAX_POINTS; ++i) points[3 * i] = 150 * i, points[3 * i + 1] = i % 2 ? 9 : -9;
     for (int i = 0; i < 24; ++i) cov[25 * i] = 0.25;
     sf_project(&camera, position, rotation, SF_MAX_POINTS, points, px);
-    sf_monitor_init(&monitor, 2 * SF_MAX_POINTS - 6, 1e-3, 1e-7, 1e-4);
+    sf_monitor_init(&monitor, 2 * SF_MAX_POINTS - 6, 1e-3, 1e-7, 1e-5);
     sf_estimate_pose(&seen, &pose);
     sf_check(&monitor, &pose, &verdict);
     sf_protect(&monitor, &seen, &pose, &levels);
