@@ -32,7 +32,7 @@ WIDE_MARGIN = 1.9  # of the first crop around a prior pose: the widest that trai
 SPOT_MARGIN = 2.2  # of the first crop where a search found something: its place and size are rough
 # What a search finds is a runway if its presence is as probable as SURE, each corner as SURE_OF_CORNER, and no
 # coordinate's sigma exceeds the share SHARP of the longer side of its box (benchmarks/search.py, docs/search.md).
-SURE, SURE_OF_CORNER, SHARP = 0.99, 0.9, 0.1
+SURE, SURE_OF_CORNER, SHARP = 0.999, 0.9, 0.09
 FOLLOWED = 6  # spots of a frame, at most, that are looked at closely
 LOOKS = 3  # crops at most, for a frame
 PRESENT = 0.5  # probability of a runway below which there is none, and of a corner below which it is not seen
