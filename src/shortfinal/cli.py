@@ -154,7 +154,6 @@ def _fly(
 ) -> None:  # fmt: skip
     """A flight: `run` without labels."""
     from shortfinal.detector import KeypointDetector, shipped_model
-    from shortfinal.files import sha256_of
     from shortfinal.pipeline import LandingPipeline
     from shortfinal.stream.fly import BUDGET_MS, Log, flight_record, fly
     from shortfinal.stream.frames import check_source, open_source
@@ -170,7 +169,7 @@ def _fly(
     pipeline = LandingPipeline(
         KeypointDetector(path), runway, camera, tracker=Tracker(), false_alarm_rate=false_alarm_rate
     )
-    about = {"name": path.name, "sha256": sha256_of([path])}
+    about = {"name": path.name, "sha256": pipeline.detector.sha256}
     flight = flight_record(source, pipeline, about, None, BUDGET_MS)
     sinks = [*wanted.opened(pipeline, flight), Log(out, flight, wanted.copies)]
     first = _box(box) if box else None
