@@ -158,7 +158,8 @@ def fly(
     `box`: where the runway is in the first frame, if known. `newest`: of a source that does not wait, only the
     newest frame is taken (default: if it is live). A sink that fails is left out and noted. Without a frame for
     `watchdog_s` a live flight gets a result that says so, and its track coasts. A frame that cannot be processed is
-    a verdict of NOT_MONITORED. Raises what the source raises.
+    a verdict of NOT_MONITORED, but for the first one, of another size than the camera's, which is refused. Raises
+    what the source raises.
     """
     mailbox = Mailbox(source, newest=source.live if newest is None else newest)
     open_sinks, stages, notes = list(sinks), Stages(), []
@@ -192,10 +193,16 @@ def fly(
                 give(last.number, pipeline.coast(last.timestamp_s + silent, f"no frame for {silent:.1f} s"), None)
                 continue
             start = time.perf_counter()
-            result = pipeline.step(frame.image, frame.timestamp_s, box=box if frames == 0 else None)
+            image: Image | None = frame.image
+            try:
+                result = pipeline.step(frame.image, frame.timestamp_s, box=box if frames == 0 else None)
+            except InputError as error:
+                if frames == 0:  # then it is the camera's file that is wrong
+                    raise
+                result, image = pipeline.coast(frame.timestamp_s, str(error)), None
             elapsed_ms = 1e3 * (time.perf_counter() - start)
             stages.add({**result.timings, "step_ms": elapsed_ms})
-            give(frame.number, result, frame.image)
+            give(frame.number, result, image)
             stages.add({"write_ms": 1e3 * (time.perf_counter() - start) - elapsed_ms})
             misses += elapsed_ms > budget_ms
             frames, last, heard = frames + 1, frame, time.monotonic()
