@@ -33,6 +33,7 @@ ENDS = (slice(0, 2), slice(2, 4))  # the keypoints of the near end and of the fa
 END_MARGIN = 1.6  # of the crop around one end: its side over the end's width, beside the first look's doubt
 SHARPER = 1.5  # an end is looked at again where that enlarges it by so much,
 MAGNIFIED = 2.0  # and the first crop magnifies the frame by less: else there is nothing more to see
+COMPARED_ROWS = 16  # every so many of a picture's rows tell whether it is the last one once more
 FLAT = 1.5  # standard deviation of a crop's levels, of 255, below which nothing can be in it
 
 
@@ -129,6 +130,7 @@ class LandingPipeline:
         self.false_alarm_rate, self.integrity_risk, self.fault_prior = false_alarm_rate, integrity_risk, fault_prior
         self.tracker = tracker
         self._last: Pose | None = None
+        self._rows, self._fresh_s = np.empty(0, np.uint8), -math.inf  # of the last picture that was new; when it came
 
     def step(
         self,
@@ -155,12 +157,24 @@ class LandingPipeline:
             )
         if not math.isfinite(timestamp_s):
             raise InputError(f"timestamp_s: {timestamp_s}; it must be finite")
+        stale_s = self._repeats(frame_rgb, timestamp_s)
+        if stale_s > 0:
+            words = f"the same picture as {stale_s:.2f} s ago: frozen"
+            return self._tracked(FrameResult(timestamp_s, None, None, None, self._not_monitored(words)), motion)
         result = self._seen(frame_rgb, timestamp_s, box, prior)
         return self._tracked(result, motion)
 
     def coast(self, timestamp_s: float, reason: str) -> FrameResult:
         """What there is to say without a frame: NOT_MONITORED for that reason, and the track carried on."""
         return self._tracked(FrameResult(timestamp_s, None, None, None, self._not_monitored(reason)), None)
+
+    def _repeats(self, frame_rgb: Image, timestamp_s: float) -> float:
+        """For how long the picture has been the same, to the bit, while time went on; a sensor's noise never is."""
+        rows = frame_rgb[::COMPARED_ROWS]
+        if np.array_equal(rows, self._rows):
+            return timestamp_s - self._fresh_s
+        self._rows, self._fresh_s = rows.copy(), timestamp_s
+        return 0.0
 
     def _tracked(self, result: FrameResult, motion: RelativeMotion | None) -> FrameResult:
         if self.tracker is None:
