@@ -114,23 +114,30 @@ class LandingPipeline:
 
         Raises InputError for a probability outside (0, 1) or a model that finds other points than these.
         """
-        further = np.empty((0, 3)) if further_points is None else as_array(further_points, (None, 3), "further_points")
-        names = detector.info.keypoints
-        if names[:4] != CORNER_NAMES or len(names) != 4 + len(further):
-            raise InputError(
-                f"detector: its keypoints are {', '.join(names)}; expected {', '.join(CORNER_NAMES)}"
-                + (f" and {len(further)} further_points" if len(further) else "")
-            )
-        self.points = np.vstack([runway.corners, further])
         for name, rate in (
             ("false_alarm_rate", false_alarm_rate), ("integrity_risk", integrity_risk), ("fault_prior", fault_prior)
         ):  # fmt: skip
             check_rate(rate, name)
-        self.detector, self.runway, self.camera = detector, runway, camera
+        self.points = _places(detector, runway, further_points)
+        self.detector, self._runway, self.camera = detector, runway, camera
         self.false_alarm_rate, self.integrity_risk, self.fault_prior = false_alarm_rate, integrity_risk, fault_prior
         self.tracker = tracker
         self._last: Pose | None = None
         self._rows, self._fresh_s = np.empty(0, np.uint8), -math.inf  # of the last picture that was new; when it came
+
+    @property
+    def runway(self) -> Runway:
+        """The one to land on."""
+        return self._runway
+
+    def land_on(self, runway: Runway, further_points: ArrayLike | None = None) -> None:
+        """Another runway from here on. Poses are in a runway's own frame, so what was known of the last one is
+        forgotten, and the track begins anew. `further_points` and errors as in the constructor.
+        """
+        self.points = _places(self.detector, runway, further_points)
+        self._runway, self._last = runway, None
+        if self.tracker is not None:
+            self.tracker.restart("the runway was changed")
 
     def step(
         self,
@@ -256,6 +263,18 @@ class LandingPipeline:
         if (bounds[2:] < 0).any() or bounds[0] >= self.camera.width or bounds[1] >= self.camera.height:
             raise InputError(f"the runway's box {np.round(bounds).tolist()} lies outside the frame")
         return bounds
+
+
+def _places(detector: KeypointDetector, runway: Runway, further_points: ArrayLike | None) -> Array:
+    """Where the model's keypoints are on the runway (K, 3), metres."""
+    further = np.empty((0, 3)) if further_points is None else as_array(further_points, (None, 3), "further_points")
+    names = detector.info.keypoints
+    if names[:4] != CORNER_NAMES or len(names) != 4 + len(further):
+        raise InputError(
+            f"detector: its keypoints are {', '.join(names)}; expected {', '.join(CORNER_NAMES)}"
+            + (f" and {len(further)} further_points" if len(further) else "")
+        )
+    return np.vstack([runway.corners, further])
 
 
 @dataclass(frozen=True, eq=False)

@@ -111,7 +111,7 @@ class Tracker:
 
     `update` takes each frame's estimate and verdict; only estimates with verdict USE are taken in,
     and of those only what the prediction does not contradict. Nothing that comes with a frame raises:
-    what cannot be used is refused with its reason. For another runway or camera, make another tracker.
+    what cannot be used is refused with its reason. For another camera, make another tracker.
     An estimate must not rest on the track itself (a prior from `predict`); an `initial` may.
     """
 
@@ -168,6 +168,10 @@ class Tracker:
         if self._belief is not None:
             return self._follow(timestamp_s, self._belief, measured, words)
         return self._search(timestamp_s, measured, words)
+
+    def restart(self, why: str) -> None:
+        """Give up the track, and any search, for a reason from outside: poses will be of another runway."""
+        self._lose(why)
 
     def _follow(self, now: float, belief: _Belief, measured: PoseEstimate | None, words: str) -> Track:
         limits, coasting = self.settings, now - self._taken_s
