@@ -194,9 +194,10 @@ class Tracker:
                 words = f"measurement refused: {tested.words} (p = {p:.1g} < {limits.false_alarm_rate:.1g})"
                 self._propose(now, measured)
         self._belief, self._in_a_row = belief, self._in_a_row + 1 if taken else 0
-        end = self._end(now, belief)
+        end, rival = self._end(now, belief), self._candidate
         if end:
             self._lose(end)
+            self._candidate = rival  # measurements that agree need not do so once more
         else:
             self._judge(coasting)
         return self._report(words, taken, p)
