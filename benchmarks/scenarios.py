@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -32,13 +33,13 @@ COLUMNS = ("fault", "rose", "after, s", "accepted meanwhile", "largest error, m"
 def row(outcome: Outcome) -> dict[str, Any]:
     """What came of a flight, as plain values."""
     fault = outcome.fault
-    words = RISES.get(fault, "") if fault else ""
-    after = outcome.rose_after_s(words) if words else None
-    first = [m.words for m in outcome.during if after is not None and m.time_s >= outcome.begin_s + after]
+    rises = RISES.get(fault, "^$") if fault else "^$"
+    after = outcome.rose_after_s(rises)
+    said = [words for m in outcome.during if not m.accepted for words in m.words.split("; ") if re.search(rises, words)]
     error, again = outcome.largest_error_m, outcome.recovered_after_s
     return {
         "fault": "none" if fault is None else fault.value,
-        "rose": first[0] if first else None,
+        "rose": said[0] if said else None,
         "after_s": None if after is None else round(after, 2),
         "frames": len(outcome.during),
         "accepted": len(outcome.accepted),
@@ -58,7 +59,7 @@ def cells(record: dict[str, Any]) -> list[str]:
         accepted += f", {record['without_a_bound']} without a bound"
     error = record["largest_error_m"]
     return [
-        record["fault"], (record["rose"] or "–").split(";")[0][:90], _number(record["after_s"]), accepted,
+        record["fault"], (record["rose"] or "–")[:90], _number(record["after_s"]), accepted,
         "–" if error is None else " / ".join(f"{e:g}" for e in error),
         _number(record["over_level"]), _number(record["again_after_s"]),
     ]  # fmt: skip

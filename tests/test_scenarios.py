@@ -200,7 +200,7 @@ def test_a_camera_that_goes_is_missed_and_taken_up_again(outcome_of):
     silent = [m for m in outcome.during if m.time_s > BEGIN_S + 0.3]
     assert silent
     assert all("no frame for" in m.words and not m.accepted for m in silent)
-    assert outcome.rose_after_s(RISES[Fault.CAMERA_GONE]) < 0.6  # the watchdog, 0.2 s, on a busy machine
+    assert outcome.rose_after_s(RISES[Fault.CAMERA_GONE]) < 1.0  # the watchdog, 0.2 s, on a busy machine
     assert outcome.recovered_after_s < 2.5  # likewise; docs/faults.md has it measured
     assert all(m.beyond() < 1.0 for m in outcome.moments if m.accepted)
 

@@ -87,7 +87,7 @@ RISES: dict[Fault, str] = {  # what must be said of a frame, as a regular expres
     Fault.WHITE: "nothing to see",
     Fault.CORRUPTED: "does not settle|no runway in view|do not fit",
     Fault.OCCLUDED: "measurement refused|do not fit|does not settle",
-    Fault.RESOLUTION: "320 x 240 pixels; the camera has 640 x 480",
+    Fault.RESOLUTION: "320 x 240 pixels",
     Fault.TIME_BACK: "is not after",
     Fault.TIME_STALLS: "is not after",
     Fault.CAMERA_GONE: "no frame for",
