@@ -522,6 +522,7 @@ def _fly_live(approach: Approach, folder: Path) -> Outcome:
         keeper = _LiveKeeper(approach, station)
 
         def stop(number: int, result: FrameResult) -> None:
+            station.begin()
             if station.clock_s() > approach.times_s[-1]:
                 source.stop()
 
@@ -561,24 +562,35 @@ class _Station:
         self._server.server_close()
 
     def clock_s(self) -> float:
-        """Time of the flight; it begins when the camera is opened."""
+        """Time of the flight."""
         return 0.0 if self._began_s is None else time.monotonic() - self._began_s
 
-    def _serve(self, asked: BaseHTTPRequestHandler) -> None:
+    def begin(self) -> None:
+        """With the first result: until then there is but the first frame, while the pipeline warms up."""
         if self._began_s is None:
             self._began_s = time.monotonic()
+
+    def _serve(self, asked: BaseHTTPRequestHandler) -> None:
         if BEGIN_S <= self.clock_s() < END_S or self.clock_s() > FRAMES / RATE_HZ:
             asked.send_error(503)
             return
         asked.send_response(200)
         asked.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
         asked.end_headers()
+        for _ in range(2):  # to open a stream takes two
+            if self._began_s is None:
+                self._send(asked, 0)
+        while self._began_s is None:
+            time.sleep(0.01)
         for n in range(round(self.clock_s() * RATE_HZ), FRAMES):
             time.sleep(max(n / RATE_HZ - self.clock_s(), 0.0))
             if BEGIN_S <= self.clock_s() < END_S:
                 return
-            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(self._jpegs[n])}\r\n\r\n"
-            asked.wfile.write(head.encode() + self._jpegs[n] + b"\r\n")
+            self._send(asked, n)
+
+    def _send(self, asked: BaseHTTPRequestHandler, n: int) -> None:
+        head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(self._jpegs[n])}\r\n\r\n"
+        asked.wfile.write(head.encode() + self._jpegs[n] + b"\r\n")
 
 
 def _numbered(image: Image, number: int) -> bytes:
