@@ -63,9 +63,9 @@ def empty_frames(folder: Path, count: int) -> list[Path]:
 
 def searched(pipeline: sf.LandingPipeline, picture: Any, times_ms: list[float]) -> FrameResult:
     """The first of three frames of the same picture that gives a crop, or the last."""
-    for frame in range(FRAMES):
+    for _ in range(FRAMES):  # at one time: the same picture later would be a frozen camera's
         start = time.perf_counter()
-        result = pipeline.step(picture, frame / 30)
+        result = pipeline.step(picture)
         times_ms.append(1e3 * (time.perf_counter() - start))
         if result.crop is not None:
             break

@@ -12,8 +12,8 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +27,8 @@ import shortfinal as sf
 import shortfinal.tracker as tracker_module
 from shortfinal.integrity import IntegrityVerdict
 from shortfinal.pose import PoseEstimate, estimate_pose_batch
-from shortfinal.tracker import Track, Tracker, TrackerSettings
+from shortfinal.tracker import Track, Tracker, TrackerSettings, TrackState
+from shortfinal.window import RelativeMotion
 
 Array = NDArray[np.float64]
 
@@ -64,6 +65,7 @@ def truth(
     acceleration: float = 0.5,
     turn_deg: float = 0.2,
     steered: bool = False,
+    speed_mps: float = SPEED_MPS,
 ) -> tuple[list[sf.Pose], Array]:
     """Poses and velocities: white acceleration (m/s² per √Hz) and a random walk of the attitude (° per √s).
 
@@ -72,7 +74,7 @@ def truth(
     a whole approach ends far from the runway.
     """
     glide = np.radians(GLIDE_DEG)
-    velocity = SPEED_MPS * np.array([np.cos(glide), 0.0, -np.sin(glide)])
+    velocity = speed_mps * np.array([np.cos(glide), 0.0, -np.sin(glide)])
     position = np.array([-start_m, rng.normal(0, 10), start_m * np.tan(glide)])
     planned, course = position - [0.0, position[1], 0.0], velocity
     angles = rng.normal(0, 1.0, 3)
@@ -98,8 +100,9 @@ def measure(
     noise: Noise,
     image: sf.Runway = RUNWAY,
     runway: sf.Runway = RUNWAY,
+    camera: sf.Camera = CAMERA,
 ) -> tuple[list[PoseEstimate], list[IntegrityVerdict]]:
-    """Estimates on `runway` of frames that show `image`, with their verdicts."""
+    """Estimates on `runway` with `CAMERA` of frames that show `image` through `camera`, with their verdicts."""
     count = len(poses)
     unit = rng.normal(size=(count, 8))
     slow = rng.normal(size=8)
@@ -108,7 +111,7 @@ def measure(
         slow = fade * slow + np.sqrt(1 - fade**2) * rng.normal(size=8)
         unit[k] = np.sqrt(noise.share) * slow + np.sqrt(1 - noise.share) * unit[k]
     sigma = rng.uniform(*noise.sigma_px, 8) * np.exp(noise.spread * rng.normal(size=(count, 8)))
-    seen = np.array([sf.project(CAMERA, pose, image.corners) for pose in poses])
+    seen = np.array([sf.project(camera, pose, image.corners) for pose in poses])
     cov = noise.inflation * sigma[:, :, None] ** 2 * np.eye(8)
     batch = estimate_pose_batch(seen + (sigma * unit).reshape(-1, 4, 2), cov, runway.corners, CAMERA, threads=1)
     estimates = [batch[k] for k in range(count)]
@@ -353,6 +356,94 @@ def endurance(flights: int, seed: int) -> list[dict[str, Any]]:
     return rows
 
 
+@dataclass(frozen=True)
+class Fault:
+    """What is not as it is taken to be, all along the approach."""
+
+    name: str
+    longer_m: float = 0.0  # of the runway in the image
+    focal: float = 1.0
+    drift_mps2: float = 0.0  # the measured position moves aside, so much faster every second
+
+
+FAULTS = (
+    Fault("none"),
+    Fault("far threshold 184 m short", longer_m=-184.0),
+    Fault("focal length 3 % long", focal=1.03),
+    Fault("drift aside, 0.2 m/s faster a second", drift_mps2=0.2),
+)
+WATCHED_M, WATCHED_MPS = (3000.0, 300.0), 65.0
+# What an aid errs by when summed, of each axis: 0.2 m/s and 0.12 degrees over 6 s.
+VELOCITY_WALK, TURN_WALK_DEG = 0.5, 0.05  # m and degrees per √s
+
+
+def watched(rng: np.random.Generator, fault: Fault, length_m: float, noise: Noise, aid: bool, rate_hz: float) -> Array:
+    """An approach with a fault from 3 km to 300 m, frame by frame: distance (m), whether the track is TRACKING,
+    whether the window says why not, and the error of its position (m; NaN without one).
+
+    `aid`: a velocity in the runway's axes comes with each frame, as GNSS measures it, turned into the camera's
+    by the frame's own attitude; and a gyro's turn.
+    """
+    start, end = WATCHED_M
+    times = np.arange(0.0, (start - end) / WATCHED_MPS, 1.0 / rate_hz)
+    poses, _ = truth(rng, times, start, steered=True, speed_mps=WATCHED_MPS)
+    aside = 0.5 * fault.drift_mps2 * times**2
+    shown = [pose.plus([0, y, 0, 0, 0, 0]) for pose, y in zip(poses, aside, strict=True)]
+    image, runway = (sf.Runway(length_m + more, 45.0) for more in (fault.longer_m, 0.0))
+    camera = replace(CAMERA, fx=fault.focal * CAMERA.fx, fy=fault.focal * CAMERA.fy)
+    estimates, verdicts = measure(rng, times, shown, noise, image, runway, camera)
+    cov = np.diag([VELOCITY_WALK**2 / rate_hz] * 3 + [np.radians(TURN_WALK_DEG) ** 2 / rate_hz] * 3)
+    tracker, rows = Tracker(), []
+    for k, t in enumerate(times):
+        motion = None
+        if aid and k:
+            before, errors = poses[k - 1], np.sqrt(np.diag(cov)) * rng.normal(size=6)
+            turned = before.runway_from_camera.T @ poses[k].plus([0, 0, 0, *errors[3:]]).runway_from_camera
+            attitude = (estimates[k - 1].pose or before).runway_from_camera
+            moved = poses[k].position_m - before.position_m + errors[:3]
+            motion = RelativeMotion(attitude.T @ moved, turned, cov)
+        tracked = tracker.update(float(t), estimates[k], verdicts[k], motion)
+        off = np.nan if tracked.pose is None else float(np.linalg.norm(tracked.pose.position_m - poses[k].position_m))
+        said = tracked.state is TrackState.DEGRADED and tracked.reason.startswith("window")
+        rows.append([-poses[k].position_m[0], tracked.state is TrackState.TRACKING, said, off])
+    return np.array(rows, np.float64)
+
+
+def watching(flights: int, seed: int, rate_hz: float = 10.0) -> list[dict[str, Any]]:
+    """Share of approaches on which the window has degraded the track by then, and on which anything has."""
+    rows = []
+    for length, sigma, aid in product((1500.0, 3000.0), (0.3, 0.8), (False, True)):
+        for fault in FAULTS:
+            rng, noise = np.random.default_rng(seed), Noise(1.0, 2.0, (sigma, sigma))
+            flown = [watched(rng, fault, length, noise, aid, rate_hz) for _ in range(flights)]
+            row: dict[str, Any] = {"fault": fault.name, "length_m": length, "sigma_px": sigma, "velocity": aid}
+            for name, column in (("window", 2), ("any", None)):
+                row[name] = [
+                    float(np.mean([_seen(one, column)[one[:, 0] >= near].any() for one in flown]))
+                    for near in WATCHED_AT_M
+                ]
+            row["unseen_error_m"] = float(np.median([_worst_unseen(one) for one in flown]))
+            rows.append(row)
+    return rows
+
+
+WATCHED_AT_M = (2000.0, 1000.0, 500.0, 300.0)
+
+
+def _seen(flown: Array, column: int | None) -> NDArray[np.bool_]:
+    """Frames in which the window speaks; or, once there was a track, in which it is not TRACKING."""
+    if column is not None:
+        return np.asarray(flown[:, column] > 0)
+    began = np.flatnonzero(flown[:, 1])
+    return np.asarray(flown[:, 1] == 0) & (np.arange(len(flown)) > (began[0] if len(began) else len(flown)))
+
+
+def _worst_unseen(flown: Array) -> float:
+    """Largest error of position (m) within 1 km while TRACKING; 0 if it never is."""
+    near = flown[(flown[:, 0] < 1000.0) & (flown[:, 1] > 0), 3]
+    return float(near.max()) if len(near) else 0.0
+
+
 def accuracy(flights: int, seed: int) -> list[dict[str, Any]]:
     """RMS errors of position (along, across, up; m), filtered and not, by distance, on whole approaches."""
     rows = []
@@ -423,6 +514,12 @@ def _print(record: dict[str, Any]) -> None:
         shares = (f"{row[key]:.1%}" for key in ("position", "all", "least"))
         table.add_row(f"{row['persists_s']:g}", f"{row['correlation_time_s']:g}", *shares)
     console.print(table)
+    table = Table("fault", "runway m", "σ px", "velocity", "window: by 2, 1, 0.5, 0.3 km", "not tracking", "unseen m")
+    for row in record["watching"]:
+        shares = (" ".join(f"{x:.0%}" for x in row[key]) for key in ("window", "any"))
+        given = f"{row['length_m']:.0f}", f"{row['sigma_px']:g}", "yes" if row["velocity"] else "-"
+        table.add_row(row["fault"], *given, *shares, f"{row['unseen_error_m']:.3g}")
+    console.print(table)
     table = Table("keypoints' errors", "taken to persist s", "m", "single: along, across, up", "filtered", "factor")
     for row in record["accuracy"]:
         metres = (" ".join(f"{x:.3g}" for x in row[key]) for key in ("single_m", "filtered_m", "factor"))
@@ -446,6 +543,7 @@ def main() -> None:
         "jumps": smallest_jumps(given.seed),
         "turn": manoeuvre(given.seed),
         "endurance": endurance(2 * given.approaches, given.seed),
+        "watching": watching(4 * given.approaches, given.seed),
         "accuracy": accuracy(given.approaches, given.seed),
     }
     if given.json:

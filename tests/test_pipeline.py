@@ -83,6 +83,18 @@ def test_without_a_box_it_looks_where_the_last_accepted_frame_was(frame):
     assert fresh.step(frame).verdict.decision is Decision.USE
 
 
+def test_the_same_picture_while_time_goes_on_is_a_frozen_camera(frame):
+    fresh = sf.LandingPipeline(sf.KeypointDetector(), RUNWAY, CAMERA)
+    assert fresh.step(frame, 1.0, box=BOX).verdict.decision is Decision.USE
+    assert fresh.step(frame, 1.0).verdict.decision is Decision.USE  # once more, for the same time
+    frozen = fresh.step(frame, 1.25)
+    assert frozen.verdict.decision is Decision.NOT_MONITORED
+    assert frozen.verdict.reasons == ("the same picture as 0.25 s ago: frozen",)
+    noisy = frame.copy()
+    noisy[::16] ^= 1  # the least that a sensor's noise does
+    assert fresh.step(noisy, 1.5).verdict.decision is Decision.USE
+
+
 def test_a_slid_corner_is_refused(pipeline):
     truth = approach_pose(50)  # where the demo injects it
     box = box_around(sf.project(CAMERA, truth, RUNWAY.corners))

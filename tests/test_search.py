@@ -123,15 +123,15 @@ def test_a_runway_is_found_and_then_followed(info):
     pipeline = sf.LandingPipeline(finder, RUNWAY, CAMERA)
     search = Search(640, 480, SIZE)
     assert search.frames == -(-len(search.windows) // WINDOWS)
-    for frame in range(search.frames):
-        result = pipeline.step(FRAME, frame / 30)
+    for _ in range(search.frames):
+        result = pipeline.step(FRAME)
         if result.verdict.decision is Decision.USE:
             break
         assert "searching for the runway" in result.verdict.reasons[0]
     assert result.verdict.decision is Decision.USE
     assert np.linalg.norm(result.estimate.pose.position_m - [-2500, 0, 150]) < 1
     asked = finder.windows
-    assert pipeline.step(FRAME, 1.0).verdict.decision is Decision.USE
+    assert pipeline.step(FRAME).verdict.decision is Decision.USE
     assert finder.windows == asked  # not searched any more
 
 
@@ -139,7 +139,7 @@ def test_two_runways_side_by_side_are_ambiguous_without_a_name(info):
     pair = [corners_from(-120.0), corners_from(120.0)]
     for ident, cross in (("XXXX/09", None), ("XXXX/09L", 120.0), ("XXXX/09R", -120.0), ("XXXX/09C", None)):
         pipeline = sf.LandingPipeline(Finder(info, pair), dataclasses.replace(RUNWAY, ident=ident), CAMERA)
-        results = [pipeline.step(FRAME, frame / 30) for frame in range(pipeline._search.frames)]
+        results = [pipeline.step(FRAME) for _ in range(pipeline._search.frames)]
         used = [r for r in results if r.verdict.decision is Decision.USE]
         if cross is None:
             assert not used
@@ -149,22 +149,22 @@ def test_two_runways_side_by_side_are_ambiguous_without_a_name(info):
             assert abs(used[0].estimate.pose.position_m[1] + cross) < 1
     pipeline = sf.LandingPipeline(Finder(info, pair), RUNWAY, CAMERA)
     prior = sf.Pose.from_attitude([-2500.0, 120.0, 150.0], 0.0, -3.0, 0.0)
-    assert pipeline.step(FRAME, 0.0, prior=prior).verdict.decision is Decision.USE
+    assert pipeline.step(FRAME, prior=prior).verdict.decision is Decision.USE
 
 
 def test_a_runway_that_is_gone_is_searched_for(info):
     finder = Finder(info, [corners_from(0.0)])
     pipeline = sf.LandingPipeline(finder, RUNWAY, CAMERA)
-    while pipeline.step(FRAME, 0.0).verdict.decision is not Decision.USE:
+    while pipeline.step(FRAME).verdict.decision is not Decision.USE:
         pass
     finder.runways = [corners_from(400.0, 1500.0)]
-    decisions = [pipeline.step(FRAME, 1 + frame / 30).verdict.decision for frame in range(5)]
+    decisions = [pipeline.step(FRAME).verdict.decision for _ in range(5)]
     assert decisions[-1] is Decision.USE
 
 
 def test_nothing_is_found_where_nothing_is(info):
     pipeline = sf.LandingPipeline(Finder(info, []), RUNWAY, CAMERA)
-    reasons = [pipeline.step(FRAME, frame / 30).verdict.reasons[0] for frame in range(pipeline._search.frames)]
+    reasons = [pipeline.step(FRAME).verdict.reasons[0] for _ in range(pipeline._search.frames)]
     count = len(search_windows(640, 480, SIZE))
     assert reasons[0] == f"searching for the runway: {WINDOWS} of {count} windows of the frame looked at, none found"
     assert reasons[-1] == f"searching for the runway: {count} of {count} windows of the frame looked at, none found"
@@ -180,8 +180,8 @@ def test_the_shipped_model_finds_a_rendered_runway_unaided():
         frame = render(scene, CAMERA, pose, Sensor(0.4, 2.0, 92), samples=2, seed=seed)
         corners = sf.project(CAMERA, pose, RUNWAY.corners)
         pipeline = sf.LandingPipeline(sf.KeypointDetector(), RUNWAY, CAMERA)
-        for n in range(3):
-            crop = pipeline.step(frame, n / 30).crop
+        for _ in range(3):
+            crop = pipeline.step(frame).crop
             if crop is not None:
                 centre = np.array([crop.left + crop.width / 2, crop.top + crop.height / 2])
                 found += bool(((centre >= corners.min(axis=0)) & (centre <= corners.max(axis=0))).all())

@@ -16,7 +16,7 @@ from scipy.stats import binom
 
 import shortfinal as sf
 from shortfinal.integrity import Decision, IntegrityVerdict
-from shortfinal.tracker import Tracker, TrackerSettings, TrackState, _rows, _triangular
+from shortfinal.tracker import Tracker, TrackerSettings, TrackState, _rows, _triangular, _Watch
 
 BENCHMARK = "tracker"
 SEARCHING, TRACKING, DEGRADED, LOST = TrackState
@@ -428,16 +428,17 @@ def test_a_far_threshold_misplaced_in_flight_is_refused(fly, moved):
 
 
 def test_refusals_that_agree_do_not_lock_the_track_out(fly, moved):
-    # The camera is right, say, and the track was wrong: who knows? No pose then, and a new search.
+    # The camera is right, say, and the track was wrong: who knows? No pose then, and a search that has found already.
     flight = moved(fly(), range(90, 180), _shifted(20.0))
     tracker = started(flight, 90)
     tracks = feed(tracker, flight, range(90, 180))
-    assert states(tracks) == [TRACKING, DEGRADED, LOST, SEARCHING, TRACKING]
+    assert states(tracks) == [TRACKING, DEGRADED, LOST, TRACKING]
     lost = next(k for k, t in enumerate(tracks) if t.state is LOST)
     assert lost * PERIOD_S == pytest.approx(0.75, abs=0.15)
     assert "contradicted by" in tracks[lost].reason
     assert re.search(r"agree among themselves, the last (19\.\d|20|20\.\d) m from the track", tracks[lost].reason)
-    assert all(track.pose is None for track in tracks[lost : lost + 5])
+    assert tracks[lost].pose is None
+    assert tracks[lost + 1].taken
     # The camera sees the runway 20 m to the left of where the database has it: it seems 20 m to the right.
     assert tracks[-1].pose.position_m[1] - flight.poses[179].position_m[1] == pytest.approx(-20, abs=1)
 
@@ -464,6 +465,51 @@ def test_a_slow_drift_is_a_velocity(fly, moved):
     assert off_m(after[-1], flight.poses[end + 29]) < 3 * np.sqrt(np.trace(after[-1].cov[:3, :3]))
 
 
+def test_frames_that_lean_one_way_degrade_the_track(fly, moved):
+    flight = moved(fly(3000.0), range(180), SHORT)
+    tracks = feed(Tracker(TrackerSettings(correlation_time_s=0.1)), flight)
+    assert sum(verdict.decision is Decision.USE for verdict in flight.verdicts) > 90  # a single frame mostly accepts it
+    assert states(tracks) == [SEARCHING, TRACKING, DEGRADED]
+    degraded = next(track for track in tracks if track.state is DEGRADED)
+    assert re.match(r"window: the frames of \d\.\d s lean one way, as if .* \(p = .* < 0\.0003\)", degraded.reason)
+    assert re.search(r"runway \d+ ± \d+ m shorter", degraded.reason)
+    assert "askew" not in degraded.reason  # what does not lean is not named
+    assert degraded.pose is not None
+
+
+def test_doubt_stays_until_there_is_little_reason_for_it(fly, moved):
+    # One frame a second: a minute with the fault, two without. Within a minute the window has forgotten.
+    flight = fly(3000.0)
+    short = moved(flight, range(60), SHORT)
+    settings = TrackerSettings(correlation_time_s=0.1)
+    watch, said, ranked = _Watch(settings), [], []
+    for k in range(180):
+        watch.look(float(k), short.estimates[k] if k < 60 else flight.estimates[k])
+        said.append(bool(watch.words))
+        ranked.append(watch._frames._suspicions()[0].p_value)
+    first, last = said.index(True), 179 - said[::-1].index(True)
+    assert first < 60 < last < 179
+    assert all(said[first : last + 1])  # once
+    assert max(ranked[first : last + 1]) > 10 * settings.false_alarm_rate  # it had passed the limit long before
+    assert ranked[last + 1] >= 0.05
+    assert watch.anew().words == ""
+
+
+@pytest.mark.parametrize("drift", [True, False], ids=["drifting", "faultless"])
+def test_with_a_velocity_a_slow_drift_is_seen(benchmark, drift):
+    fault = next(fault for fault in benchmark.FAULTS if bool(fault.drift_mps2) == drift)
+    noise = benchmark.Noise(1.0, 2.0, (0.5, 0.5))
+    alone, aided = (
+        benchmark.watched(np.random.default_rng(4), fault, 1500.0, noise, aid, 5.0) for aid in (False, True)
+    )
+    assert not alone[:, 2].any()
+    assert aided[:, 2].any() == drift
+    if drift:
+        assert alone[-1, 3] > 100  # followed, as if the aircraft drifted
+        seen_s = np.flatnonzero(aided[:, 2])[0] / 5.0
+        assert 0.5 * fault.drift_mps2 * seen_s**2 < 50  # m aside by then
+
+
 @pytest.mark.parametrize("short", [True, False], ids=["short", "right"])
 def test_the_window_degrades_the_track_in_its_words(fly, moved, short):
     flight = fly(3000.0, 6.0)
@@ -480,7 +526,8 @@ def test_the_window_degrades_the_track_in_its_words(fly, moved, short):
         before = pose
     if short:
         degraded = next(track for track in tracks if track.state is DEGRADED)
-        assert degraded.reason.startswith("window: residual")
+        assert degraded.reason.startswith("window: ")
+        assert tracker._watch._refusal.startswith("window: residual")
         assert "runway" in degraded.reason
         assert "shorter" in degraded.reason
         assert tracks[-1].state is DEGRADED

@@ -16,7 +16,7 @@ import shortfinal as sf
 from shortfinal.errors import InputError
 from shortfinal.protection import GLIDE_PATH_ORIGIN_M
 from shortfinal.view.live import QUEUE, LiveView
-from shortfinal.view.page import DECISIONS, row_of, write_replay
+from shortfinal.view.page import DECISIONS, full_scale_deg, row_of, write_replay
 
 CAMERA = sf.Camera(640, 480, 1300.0, 1300.0, 319.5, 239.5, (-0.1, 0.02, 0.001, -0.001))
 RUNWAY = sf.Runway(1500.0, 45.0, "TEST/09")
@@ -145,6 +145,18 @@ def test_deviations_and_their_sigma_are_those_of_the_protection_levels():
     assert numbers["lateral"] == pytest.approx(math.degrees(math.atan2(25.0, 2700.0)), abs=1e-4)
     elevation = math.degrees(math.atan2(90.0, math.hypot(1500.0, 25.0)))
     assert numbers["vertical"] == pytest.approx(elevation - 3.0, abs=1e-4)
+
+
+def test_two_dots_are_an_ils_receivers_full_scale():
+    # 0.155 DDM at 0.00145 a metre: 106.9 m beside the threshold, which the far end sees at 2.04 degrees over 3,000 m
+    # and at 4.08 over 1,500 m; but a course sector is 6 degrees wide at most. 0.175 DDM at 0.24 of 3 degrees.
+    assert full_scale_deg(3000.0)["lateral"] == pytest.approx(2.0407, abs=1e-4)
+    assert 3000.0 * math.tan(math.radians(full_scale_deg(3000.0)["lateral"])) == pytest.approx(106.9, abs=0.05)
+    assert full_scale_deg(1500.0) == pytest.approx({"lateral": 3.0, "vertical": 0.72})
+    # 25 m left of the line 1,200 m before the threshold: 0.17 of the scale, a third of a dot.
+    record = {"timestamp_s": 1.0, "decision": "use", "position_m": [-1200.0, 25.0, 90.0], "attitude_deg": [0, 0, 0]}
+    share = row_of(record, 3000.0).numbers["lateral"] / full_scale_deg(3000.0)["lateral"]
+    assert share == pytest.approx(25.0 / (4200.0 * 106.9 / 3000.0), rel=1e-3)
 
 
 def test_a_level_that_cannot_be_given_is_infinite_and_one_that_is_not_there_is_absent():

@@ -15,7 +15,16 @@ from test_pose import CAMERA
 import shortfinal as sf
 from shortfinal.integrity import Decision
 from shortfinal.pose import estimate_pose_batch
-from shortfinal.window import SUSPECTS, IntegrityWindow, RelativeMotion, Suspect, check_window
+from shortfinal.window import (
+    FRAME_SUSPECTS,
+    SUSPECTS,
+    FadingWindow,
+    IntegrityWindow,
+    RelativeMotion,
+    Suspect,
+    _in_residual,
+    check_window,
+)
 
 RATES = (0.05, 0.01, 0.001)
 RUNWAY = sf.Runway(1500.0, 45.0)
@@ -441,3 +450,132 @@ def test_what_cannot_be_checked_is_not_monitored():
         assert re.search(reason, verdict.reasons[0])
         assert verdict.statistic is verdict.p_value is verdict.pose is verdict.covs is None
         assert verdict.suspicions == ()
+
+
+# Frame after frame without motion, errors persisting
+
+
+TAU_S, PERIOD_S = 2.0, 0.5
+
+
+def persisting(rng, count, time_s):
+    """Unit errors (count, 8), a period apart, that persist as a first-order Gauss-Markov process."""
+    unit, fade = rng.normal(size=(count, 8)), np.exp(-PERIOD_S / time_s)
+    for k in range(1, count):
+        unit[k] = fade * unit[k - 1] + np.sqrt(1 - fade**2) * unit[k]
+    return unit
+
+
+def faded(estimates, time_s=TAU_S):
+    """What a window says of each frame's past."""
+    window = FadingWindow(time_s)
+    return [window.push(PERIOD_S * k, estimate) for k, estimate in enumerate(estimates)]
+
+
+@lru_cache
+def approaches(full, time_s, taken_s=TAU_S, count=200):
+    """Least p of the suspects at the end of faultless approaches of 12 s, sigma changing from frame to frame."""
+    rng, found = np.random.default_rng([full, 40]), []
+    for _ in range(count):
+        poses = flight(rng, rng.uniform(1200, 3000), 24, 70.0 * PERIOD_S)
+        seen = frames(rng, poses, rng.choice([0.3, 0.8]), full, noise=persisting(rng, 24, time_s))
+        found.append(faded(seen, taken_s)[-1][0].p_value)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("full", [False, True], ids=["unequal sigma", "full covariance"])
+@pytest.mark.parametrize("time_s", [TAU_S, 0.2])
+def test_errors_that_persist_raise_no_more_alarms_than_stated(full, time_s):
+    p = approaches(full, time_s)
+    for rate in RATES:
+        assert np.sum(p < rate / len(FRAME_SUSPECTS)) <= binom.ppf(1 - 1e-3, len(p), rate)
+
+
+def test_errors_that_persist_for_longer_do():
+    # Twenty looks at one error are no twenty proofs: the rate rests on the time.
+    p = approaches(False, TAU_S, 0.0)
+    assert np.mean(p < 0.01 / len(FRAME_SUSPECTS)) > 0.2
+
+
+def test_the_bound_is_exact_where_nothing_moves():
+    # The same pose and sigma in each frame: every effect is the same, and Cauchy-Schwarz an equality.
+    rng, found = np.random.default_rng(41), []
+    pose = flight(rng, 1500.0, 1)[0]
+    cov = np.diag(rng.uniform(0.1, 0.4, 8) ** 2)
+    truth = sf.project(CAMERA, pose, RUNWAY.corners).ravel()
+    for _ in range(300):
+        px = truth + persisting(rng, 10, TAU_S) @ np.sqrt(cov)
+        batch = estimate_pose_batch(px.reshape(-1, 4, 2), cov, RUNWAY.corners, CAMERA)
+        ranked = faded([batch[k] for k in range(10)])[-1]
+        found.append([next(s.p_value for s in ranked if s.suspect is suspect) for suspect in FRAME_SUSPECTS])
+    assert all(kstest(p, "uniform").pvalue > 1e-3 / len(FRAME_SUSPECTS) for p in np.transpose(found))
+
+
+def test_the_sums_are_what_they_are_said_to_be():
+    rng = np.random.default_rng(42)
+    poses, times = flight(rng, 2000.0, 5), np.array([0.0, 0.3, 1.1, 1.2, 4.0])
+    seen, window = frames(rng, poses), FadingWindow(2.0, memory_s=5.0)
+    ranked = [window.push(t, est) for t, est in zip(times, seen)][-1]
+    effects = np.array([_in_residual(est, FRAME_SUSPECTS) for est in seen])  # (5, 8, S)
+    weight, size = np.exp((times - times[-1]) / 5.0), np.linalg.norm(effects, axis=1)
+    score = np.einsum("k,kn,kns->s", weight, [est.residual for est in seen], effects)
+    alike = np.exp(-np.abs(times[:, None] - times) / 2.0)
+    variance = np.einsum("k,j,ks,js,kj->s", weight, weight, size, size, alike)
+    information = weight @ size**2
+    for s, suspect in enumerate(FRAME_SUSPECTS):
+        found = next(one for one in ranked if one.suspect is suspect)
+        np.testing.assert_allclose(found.statistic, score[s] ** 2 / variance[s], rtol=1e-10)
+        np.testing.assert_allclose(found.value, score[s] / information[s], rtol=1e-10)
+        np.testing.assert_allclose(found.sigma, np.sqrt(variance[s]) / information[s], rtol=1e-10)
+    assert [one.statistic for one in ranked] == sorted((one.statistic for one in ranked), reverse=True)
+
+
+@pytest.mark.parametrize("suspect", FRAME_SUSPECTS, ids=lambda s: s.name)
+def test_a_unit_of_a_suspect_leaves_this_in_the_residual(suspect):
+    rng, size = np.random.default_rng(43), 1e-3
+    pose = flight(rng, 1500.0, 1)[0]
+    wrong = sf.Runway(1500.0, 45.0, corners=RUNWAY.corners + size * np.array(suspect.shift or np.zeros((4, 3))))
+    camera = replace(CAMERA, fx=(1 + size * suspect.zoom) * CAMERA.fx, fy=(1 + size * suspect.zoom) * CAMERA.fy)
+    cov = np.diag(rng.uniform(0.3, 1.0, 8) ** 2)
+    px = sf.project(camera, pose, wrong.corners)
+    est = sf.estimate_pose(sf.GaussianKeypoints(px, cov), RUNWAY.corners, CAMERA)
+    effect = _in_residual(est, [suspect])[:, 0]
+    np.testing.assert_allclose(est.residual / size, effect, atol=2e-3 * np.abs(effect).max())
+
+
+def test_frames_that_pass_each_by_itself_show_the_far_threshold_together():
+    rng = np.random.default_rng(44)
+    poses = flight(rng, 3000.0, 50, 70.0 * PERIOD_S)
+    seen = frames(rng, poses, 0.8, image=SHORT, noise=persisting(rng, 50, TAU_S))
+    ranked = faded(seen)[-1]
+    assert np.mean([sf.check_integrity(est).decision is Decision.USE for est in seen]) > 0.8
+    assert ranked[0].p_value < 1e-4
+    length = next(one for one in ranked if one.suspect.name == "runway" and one.suspect.words[0] == "shorter")
+    assert abs(length.value + 184) < 4 * length.sigma
+    assert "m shorter" in str(length)
+
+
+def test_a_world_of_another_size_leaves_nothing():
+    # Length, width and path 3 % larger: the same pictures.
+    rng = np.random.default_rng(45)
+    poses = flight(rng, 3000.0, 20)
+    larger = sf.Runway(1.03 * 1500.0, 1.03 * 45.0)
+    seen = frames(rng, poses, 0.3, image=larger, noise=np.zeros((20, 8)))
+    assert min(ranked[0].p_value for ranked in faded(seen)) > 0.999
+
+
+def test_a_frame_without_an_estimate_says_nothing():
+    rng, window = np.random.default_rng(46), FadingWindow(TAU_S)
+    [good] = frames(rng, flight(rng, 1500.0, 1))
+    bad = sf.estimate_pose(good.keypoints, np.zeros((4, 3)), CAMERA)
+    assert all(one.p_value == 1.0 and one.sigma == np.inf for one in window.push(0.0, bad))
+    assert window.push(1.0, good) == window.push(2.0, bad)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [((-1.0,), "correlation_time_s is -1"), ((np.nan,), "correlation_time_s"), ((2.0, 0.0), "memory_s is 0")],
+)
+def test_a_fading_window_without_sense_is_refused(given, words):
+    with pytest.raises(sf.InputError, match=words):
+        FadingWindow(*given)

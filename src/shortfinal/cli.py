@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from shortfinal.evaluate.frames import Evaluation as RunFigures
     from shortfinal.evaluate.run import Evaluation
     from shortfinal.pipeline import FrameResult, LandingPipeline
-    from shortfinal.stream.fly import Sink
+    from shortfinal.protection import AlertLimits
+    from shortfinal.stream.sink import Sink
 
 T = TypeVar("T")
 
@@ -129,6 +130,9 @@ def run(
     fps: Annotated[float | None, typer.Option(help="Frames a second of a folder; 30 by default.")] = None,
     copies: Annotated[int, typer.Option(min=0, help="Keep a copy of every so many frames of a flight; 0: none.")] = 1,
     mavlink: Annotated[str, typer.Option(help="To an autopilot: udpout:127.0.0.1:14550, /dev/ttyACM0:921600.")] = "",
+    alert_limits: Annotated[str, typer.Option(help="What a flight tolerates: along,cross,vertical, m, e.g. "
+                                                   "inf,40,35.")] = "",
+    video: Annotated[Path | None, typer.Option(help="Also as a video with the results drawn in (.mp4).")] = None,
     mcap: Annotated[Path | None, typer.Option(help="Also as MCAP, for Foxglove.")] = None,
     parquet: Annotated[Path | None, typer.Option(help="Also as Parquet, in parts, into this folder.")] = None,
     rerun: Annotated[Path | None, typer.Option(help="Also for Rerun (.rrd).")] = None,
@@ -142,22 +146,23 @@ def run(
     given = _sized_runway(size, runway) if size else find_runway(runway, runways) if runway else None
     lens = read_camera(camera) if camera else None
     if labels is None and not (Path(source) / "labels.csv").is_file():
-        sinks = _Sinks(mavlink, mcap, parquet, rerun, view, copies)
-        _fly(source, lens, given, out, model, false_alarm_rate, box, fps, sinks, as_json=as_json)
+        sinks = _Sinks(mavlink, video, mcap, parquet, rerun, view, copies)
+        limits = _limits(alert_limits) if alert_limits else None
+        _fly(source, lens, given, out, model, false_alarm_rate, box, fps, limits, sinks, as_json=as_json)
         return
     _run_labelled(Path(source), labels, lens, given, runways, out, model, false_alarm_rate, as_json=as_json)
 
 
 def _fly(
     source: str, camera: Any, runway: Any, out: Path, model: Path | None, false_alarm_rate: float, box: str,
-    fps: float | None, wanted: _Sinks, *, as_json: bool,
+    fps: float | None, limits: AlertLimits | None, wanted: _Sinks, *, as_json: bool,
 ) -> None:  # fmt: skip
     """A flight: `run` without labels."""
     from shortfinal.detector import KeypointDetector, shipped_model
-    from shortfinal.files import sha256_of
     from shortfinal.pipeline import LandingPipeline
-    from shortfinal.stream.fly import BUDGET_MS, Log, flight_record, fly
-    from shortfinal.stream.frames import check_source, open_source
+    from shortfinal.stream.fly import BUDGET_MS, flight_record, fly
+    from shortfinal.stream.frames import FPS, check_source, open_source
+    from shortfinal.stream.sink import Log
     from shortfinal.tracker import Tracker
 
     check_source(source)
@@ -165,17 +170,16 @@ def _fly(
         raise InputError(f"{source}: a flight needs its camera: pass --camera (width, height, fx, fy, cx, cy)")
     if runway is None:
         raise InputError(f"{source}: a flight needs its runway: pass --size 2000x45, or --runway LFPO/24 and --runways")
-    frames = open_source(source, camera, fps)
+    first = _box(box) if box else None
     path = model or shipped_model()
     pipeline = LandingPipeline(
         KeypointDetector(path), runway, camera, tracker=Tracker(), false_alarm_rate=false_alarm_rate
     )
-    about = {"name": path.name, "sha256": sha256_of([path])}
-    flight = flight_record(source, pipeline, about, None, BUDGET_MS)
-    sinks = [*wanted.opened(pipeline, flight), Log(out, flight, wanted.copies)]
-    first = _box(box) if box else None
-    if not as_json:
-        _compile(levels=True)
+    about = {"name": path.name, "sha256": pipeline.detector.sha256}
+    flight = flight_record(source, pipeline, about, limits, BUDGET_MS)
+    _compile(levels=True, quiet=as_json)  # a camera that is open does not wait for it
+    frames = open_source(source, camera, fps)
+    sinks = [*wanted.opened(pipeline, flight, getattr(frames, "fps", FPS)), Log(out, flight, wanted.copies)]
     with _bar() as bar:
         task = bar.add_task("frames", total=getattr(frames, "count", None), visible=not as_json)
         flown = fly(frames, pipeline, sinks, box=first, progress=lambda *_: bar.advance(task))
@@ -190,7 +194,10 @@ def _fly(
     for stage, times in flown.stages.items():
         table.add_row(stage.removesuffix("_ms"), *(f"{times[q]:.2f}" for q in ("p50", "p95", "p99")))
     console.print(table)
-    console.print(f"{flown.dropped} frames overtaken by newer ones, {flown.misses} results later than {BUDGET_MS:g} ms")
+    console.print(
+        f"warm-up {flown.warm_up_s:.1f} s; {flown.dropped} frames overtaken by newer ones, {flown.misses} results "
+        f"later than {BUDGET_MS:g} ms, {flown.pictures_dropped} pictures not kept for want of time"
+    )
     for note in flown.notes:
         console.print(Text(note))
     console.print(f"written: {out}/flight.json, frames.jsonl; to look at: shortfinal view {out}")
@@ -201,19 +208,24 @@ class _Sinks:
     """Where a flight's results go besides its folder."""
 
     mavlink: str
+    video: Path | None
     mcap: Path | None
     parquet: Path | None
     rerun: Path | None
     view: bool
     copies: int  # of every so many frames, in the folder
 
-    def opened(self, pipeline: LandingPipeline, flight: dict[str, Any]) -> list[Sink]:
-        """Those that are wanted."""
+    def opened(self, pipeline: LandingPipeline, flight: dict[str, Any], fps: float) -> list[Sink]:
+        """Those that are wanted; `fps` of the video."""
         sinks: list[Sink] = []
         if self.mavlink:
             from shortfinal.stream.mavlink import MavlinkSink
 
             sinks.append(MavlinkSink(self.mavlink))
+        if self.video:
+            from shortfinal.stream.sink import AnnotatedVideo
+
+            sinks.append(AnnotatedVideo(self.video, pipeline.camera, pipeline.runway, fps))
         if self.mcap:
             from shortfinal.stream.mcap import McapSink
 
@@ -227,7 +239,7 @@ class _Sinks:
 
             sinks.append(RerunSink(self.rerun, pipeline.camera, pipeline.runway))
         if self.view:
-            from shortfinal.stream.fly import Live
+            from shortfinal.stream.sink import Live
 
             sinks.append(live := Live(flight))
             console.print(f"live: {live.url}")
@@ -251,6 +263,17 @@ def _box(text: str) -> list[float]:
     if len(values) != 4 or not (values[0] < values[2] and values[1] < values[3]):
         raise InputError(f"--box: {text!r}; expected left,top,right,bottom in pixels, left < right and top < bottom")
     return values
+
+
+def _limits(text: str) -> AlertLimits:
+    from shortfinal.protection import AlertLimits
+
+    try:
+        along, cross, vertical = (float(part) for part in text.split(","))
+        return AlertLimits(along, cross, vertical)
+    except ValueError as error:
+        raise InputError(f"--alert-limits: {text!r}; expected along,cross,vertical in metres, each over 0; inf for an "
+                         "axis without limit") from error  # fmt: skip
 
 
 def _run_labelled(
@@ -704,11 +727,12 @@ def _run_folder(
     return evaluation, results
 
 
-def _compile(*, levels: bool = False, scenes: bool = False) -> None:
+def _compile(*, levels: bool = False, scenes: bool = False, quiet: bool = False) -> None:
     """Compile the kernels with something to look at."""
     from shortfinal.warm import warm_up
 
-    with console.status("compiling the kernels (once on this machine, most of a minute) ..."):
+    words = "compiling the kernels (once on this machine, most of a minute) ..."
+    with nullcontext() if quiet else console.status(words):
         warm_up(levels=levels, scenes=scenes)
 
 

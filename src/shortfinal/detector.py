@@ -5,6 +5,7 @@ The only preprocessing code of the package: training uses `crop_image` and `norm
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -143,7 +144,7 @@ class KeypointDetector:
         the network gives them. Raises InputError if the file is missing, is no ONNX model, or does not
         describe itself.
         """
-        self._session, self.info = _load(path, threads)
+        self._session, self.info, self.sha256 = _load(path, threads)  # of the file as it was loaded
         self.calibration = self.info.calibration if calibrated else None
         scale = self.calibration.sigma_scale if self.calibration else ()
         self._gain = np.outer(scale, scale) if scale else None  # of the covariance: D C D, D diagonal
@@ -317,7 +318,7 @@ def shipped_model() -> Path:
     return Path(str(files("shortfinal") / "models" / "runway.onnx"))
 
 
-def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo]:
+def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo, str]:
     import onnxruntime
 
     source = Path(path) if path is not None else shipped_model()
@@ -327,7 +328,8 @@ def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo]:
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
     try:
-        session = onnxruntime.InferenceSession(str(source), options, providers=["CPUExecutionProvider"])
+        content = source.read_bytes()
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime has no common base class for what a broken file raises
         raise InputError(f"{source}: not an ONNX model: {str(error).splitlines()[0][:120]}") from error
     text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
@@ -345,7 +347,7 @@ def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo]:
     if shape != (3, info.size, info.size) or not fits:
         given = ", ".join(f"{name} {sizes}" for name, sizes in outputs.items())
         raise InputError(f"{source}: it takes {shape} and gives {given}, unlike its description; export it again")
-    return session, info
+    return session, info, hashlib.sha256(content).hexdigest()
 
 
 def described(model: bytes, info: ModelInfo) -> bytes:

@@ -40,6 +40,7 @@ ENDS = (slice(0, 2), slice(2, 4))  # the keypoints of the near end and of the fa
 END_MARGIN = 1.6  # of the crop around one end: its side over the end's width, beside the first look's doubt
 SHARPER = 1.5  # an end is looked at again where that enlarges it by so much,
 MAGNIFIED = 2.0  # and the first crop magnifies the frame by less: else there is nothing more to see
+COMPARED_ROWS = 16  # every so many of a picture's rows tell whether it is the last one once more
 FLAT = 1.5  # standard deviation of a crop's levels, of 255, below which nothing can be in it
 
 
@@ -120,23 +121,33 @@ class LandingPipeline:
 
         Raises InputError for a probability outside (0, 1) or a model that finds other points than these.
         """
-        further = np.empty((0, 3)) if further_points is None else as_array(further_points, (None, 3), "further_points")
-        names = detector.info.keypoints
-        if names[:4] != CORNER_NAMES or len(names) != 4 + len(further):
-            raise InputError(
-                f"detector: its keypoints are {', '.join(names)}; expected {', '.join(CORNER_NAMES)}"
-                + (f" and {len(further)} further_points" if len(further) else "")
-            )
-        self.points = np.vstack([runway.corners, further])
         for name, rate in (
             ("false_alarm_rate", false_alarm_rate), ("integrity_risk", integrity_risk), ("fault_prior", fault_prior)
         ):  # fmt: skip
             check_rate(rate, name)
-        self.detector, self.runway, self.camera = detector, runway, camera
+        self.points = _places(detector, runway, further_points)
+        self.detector, self._runway, self.camera = detector, runway, camera
         self.false_alarm_rate, self.integrity_risk, self.fault_prior = false_alarm_rate, integrity_risk, fault_prior
         self.tracker = tracker
         self._last: Pose | None = None
         self._search = Search(camera.width, camera.height, detector.info.size) if detector.searches else None
+        self._rows, self._fresh_s = np.empty(0, np.uint8), -math.inf  # of the last picture that was new; when it came
+
+    @property
+    def runway(self) -> Runway:
+        """The one to land on."""
+        return self._runway
+
+    def land_on(self, runway: Runway, further_points: ArrayLike | None = None) -> None:
+        """Another runway from here on. Poses are in a runway's own frame, so what was known of the last one is
+        forgotten, and the track begins anew. `further_points` and errors as in the constructor.
+        """
+        self.points = _places(self.detector, runway, further_points)
+        self._runway, self._last = runway, None
+        if self._search is not None:
+            self._search.again()
+        if self.tracker is not None:
+            self.tracker.restart("the runway was changed")
 
     def step(
         self,
@@ -163,12 +174,24 @@ class LandingPipeline:
             )
         if not math.isfinite(timestamp_s):
             raise InputError(f"timestamp_s: {timestamp_s}; it must be finite")
+        stale_s = self._repeats(frame_rgb, timestamp_s)
+        if stale_s > 0:
+            words = f"the same picture as {stale_s:.2f} s ago: frozen"
+            return self._tracked(FrameResult(timestamp_s, None, None, None, self._not_monitored(words)), motion)
         result = self._seen(frame_rgb, timestamp_s, box, prior)
         return self._tracked(result, motion)
 
     def coast(self, timestamp_s: float, reason: str) -> FrameResult:
         """What there is to say without a frame: NOT_MONITORED for that reason, and the track carried on."""
         return self._tracked(FrameResult(timestamp_s, None, None, None, self._not_monitored(reason)), None)
+
+    def _repeats(self, frame_rgb: Image, timestamp_s: float) -> float:
+        """For how long the picture has been the same, to the bit, while time went on; a sensor's noise never is."""
+        rows = frame_rgb[::COMPARED_ROWS]
+        if np.array_equal(rows, self._rows):
+            return timestamp_s - self._fresh_s
+        self._rows, self._fresh_s = rows.copy(), timestamp_s
+        return 0.0
 
     def _tracked(self, result: FrameResult, motion: RelativeMotion | None) -> FrameResult:
         if self.tracker is None:
@@ -309,6 +332,18 @@ class LandingPipeline:
         if (bounds[2:] < 0).any() or bounds[0] >= self.camera.width or bounds[1] >= self.camera.height:
             raise InputError(f"the runway's box {np.round(bounds).tolist()} lies outside the frame")
         return bounds
+
+
+def _places(detector: KeypointDetector, runway: Runway, further_points: ArrayLike | None) -> Array:
+    """Where the model's keypoints are on the runway (K, 3), metres."""
+    further = np.empty((0, 3)) if further_points is None else as_array(further_points, (None, 3), "further_points")
+    names = detector.info.keypoints
+    if names[:4] != CORNER_NAMES or len(names) != 4 + len(further):
+        raise InputError(
+            f"detector: its keypoints are {', '.join(names)}; expected {', '.join(CORNER_NAMES)}"
+            + (f" and {len(further)} further_points" if len(further) else "")
+        )
+    return np.vstack([runway.corners, further])
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from shortfinal.errors import InputError
 from shortfinal.geometry import Pose, frozen, log_kernel, project_kernel, so3_exp
 from shortfinal.integrity import FALSE_ALARM_RATE, Decision, IntegrityVerdict, check_rate
 from shortfinal.pose import PoseEstimate, SolverStatus
-from shortfinal.window import IntegrityWindow, RelativeMotion
+from shortfinal.window import FadingWindow, IntegrityWindow, RelativeMotion
 
 Array = NDArray[np.float64]
 
@@ -30,6 +30,7 @@ VELOCITY_SIGMA_MPS = 100.0  # of each axis, about rest, before anything was meas
 # Frames of the odometry's window are so many correlation times apart: errors then correlate by 5 %.
 WINDOW_SPACING = 3.0
 WINDOW_LENGTH = 20  # frames
+RELIEF_P = 0.05  # of the most suspicious fault, from which on the frames' residuals are in doubt no more
 
 _POSE, _VELOCITY, _ERROR = slice(0, 6), slice(6, 9), slice(9, 15)
 _POSITION, _TURN = slice(0, 3), slice(3, 6)
@@ -111,7 +112,7 @@ class Tracker:
 
     `update` takes each frame's estimate and verdict; only estimates with verdict USE are taken in,
     and of those only what the prediction does not contradict. Nothing that comes with a frame raises:
-    what cannot be used is refused with its reason. For another runway or camera, make another tracker.
+    what cannot be used is refused with its reason. For another camera, make another tracker.
     An estimate must not rest on the track itself (a prior from `predict`); an `initial` may.
     """
 
@@ -120,7 +121,7 @@ class Tracker:
         self._state, self._why = TrackState.SEARCHING, "no measurement yet"
         self._belief: _Belief | None = None  # the track
         self._candidate: _Candidate | None = None  # for a track: what is found in a search, or what contradicts
-        self._watch: _Watch | None = None  # where there is odometry
+        self._watch = _Watch(self.settings)
         self._time_s = self._stale_s = -math.inf  # of the last frame; of the last one out of order
         self._taken_s = 0.0  # the last measurement taken in; before any, the first frame
         self._in_a_row = self._stale = self._rewound = 0  # frames: taken; out of order; of those, running forward
@@ -152,22 +153,24 @@ class Tracker:
     ) -> Track:
         """The track with this frame.
 
-        `motion` is what odometry measured since the last update, independently of the frames; from
-        the first one on an `IntegrityWindow` watches, and degrades the track while it refuses.
+        What the frames leave over is watched by a `FadingWindow`. `motion` is what odometry measured since
+        the last update, independently of the frames; from the first one on an `IntegrityWindow` watches as
+        well. While either refuses, the track is degraded.
         """
         if not (math.isfinite(timestamp_s) and timestamp_s > self._time_s):
             return self._out_of_order(timestamp_s)
         if self._time_s == -math.inf:
             self._taken_s = timestamp_s
         self._time_s, self._stale, self._rewound = timestamp_s, 0, 0
-        if motion is not None and self._watch is None:
-            self._watch = _Watch(WINDOW_SPACING * self.settings.correlation_time_s)
-        elif self._watch is not None:
-            self._watch.move(motion)
+        self._watch.move(motion)
         measured, words = _usable(estimate, verdict)
         if self._belief is not None:
             return self._follow(timestamp_s, self._belief, measured, words)
         return self._search(timestamp_s, measured, words)
+
+    def restart(self, why: str) -> None:
+        """Give up the track, and any search, for a reason from outside: poses will be of another runway."""
+        self._lose(why)
 
     def _follow(self, now: float, belief: _Belief, measured: PoseEstimate | None, words: str) -> Track:
         limits, coasting = self.settings, now - self._taken_s
@@ -184,15 +187,15 @@ class Tracker:
             if taken:
                 belief, words = tested.belief, f"measurement taken in (p = {p:.2g})"
                 self._taken_s, coasting, self._candidate = now, 0.0, None
-                if self._watch is not None:
-                    self._watch.look(now, measured)
+                self._watch.look(now, measured)
             else:
                 words = f"measurement refused: {tested.words} (p = {p:.1g} < {limits.false_alarm_rate:.1g})"
                 self._propose(now, measured)
         self._belief, self._in_a_row = belief, self._in_a_row + 1 if taken else 0
-        end = self._end(now, belief)
+        end, rival = self._end(now, belief), self._candidate
         if end:
             self._lose(end)
+            self._candidate = rival  # measurements that agree need not do so once more
         else:
             self._judge(coasting)
         return self._report(words, taken, p)
@@ -217,7 +220,7 @@ class Tracker:
 
     def _judge(self, coasting: float) -> None:
         """TRACKING or DEGRADED, each held until there is reason enough for the other."""
-        limits, doubt = self.settings, self._watch.words if self._watch is not None else ""
+        limits, doubt = self.settings, self._watch.words
         if self._state is TrackState.TRACKING and (doubt or coasting > limits.degraded_after_s):
             self._state = TrackState.DEGRADED
             self._why = doubt or f"no measurement was taken in for {coasting:.2f} s"
@@ -262,8 +265,7 @@ class Tracker:
         self._rewound = self._rewound + 1 if timestamp_s > self._stale_s else 0
         self._stale_s = timestamp_s
         words = f"timestamp {timestamp_s:.3f} s is not after {self._time_s:.3f} s: frame not taken in"
-        if self._watch is not None:
-            self._watch.move(None)
+        self._watch.move(None)
         if self._rewound >= self.settings.confirmations and math.isfinite(timestamp_s):
             self._lose(f"the clock was set back from {self._time_s:.3f} s to {timestamp_s:.3f} s")
             self._time_s = self._taken_s = timestamp_s
@@ -275,8 +277,7 @@ class Tracker:
     def _lose(self, why: str) -> None:
         self._state, self._why = TrackState.LOST, why
         self._belief, self._candidate, self._in_a_row = None, None, 0
-        if self._watch is not None:
-            self._watch = _Watch(self._watch.spacing_s)
+        self._watch = self._watch.anew()
 
     def _report(self, words: str, taken: bool = False, p: float | None = None) -> Track:
         reason = f"{self._why}; this frame: {words}"
@@ -287,30 +288,53 @@ class Tracker:
 
 
 class _Watch:
-    """The integrity window, fed with taken measurements so far apart that each errs on its own."""
+    """What measurements that were taken in show only together: of their residuals, and against odometry."""
 
-    def __init__(self, spacing_s: float) -> None:
-        self.spacing_s, self.words = spacing_s, ""
-        self._window, self._looked_s = IntegrityWindow(WINDOW_LENGTH), -math.inf
+    def __init__(self, settings: TrackerSettings, odometry: bool = False) -> None:
+        self._settings, self._spacing_s = settings, WINDOW_SPACING * settings.correlation_time_s
+        self._frames, self._doubt, self._since_s = FadingWindow(settings.correlation_time_s), "", math.inf
+        # With odometry: measurements so far apart that each errs on its own.
+        self._window = IntegrityWindow(WINDOW_LENGTH, settings.false_alarm_rate) if odometry else None
+        self._refusal, self._looked_s = "", -math.inf
         self._moved: RelativeMotion | None = None  # since the last look
         self._fresh = True  # no motion since the last look
 
+    @property
+    def words(self) -> str:
+        """Why the track is in doubt; nothing if it is not."""
+        return self._doubt or self._refusal
+
+    def anew(self) -> _Watch:
+        """One that has seen nothing yet."""
+        return _Watch(self._settings, self._window is not None)
+
     def move(self, motion: RelativeMotion | None) -> None:
-        """The motion since the last call; None: unknown."""
-        if self._fresh:
+        """The motion since the last call; None: unknown. With the first one, the watch over odometry begins."""
+        if self._window is None and motion is not None:
+            self._window = IntegrityWindow(WINDOW_LENGTH, self._settings.false_alarm_rate)
+        elif self._fresh:
             self._moved = motion
         else:
             self._moved = None if self._moved is None or motion is None else self._moved.then(motion)
-        self._fresh = False
+        self._fresh = self._window is None
 
     def look(self, now: float, measured: PoseEstimate) -> None:
-        """Takes the frame into the window, if it is time; what it then says holds until the next."""
-        if now - self._looked_s < self.spacing_s:
-            return
-        verdict = self._window.push(measured, self._moved)
-        self._looked_s, self._fresh = now, True
-        if verdict.decision is not Decision.NOT_MONITORED:
-            self.words = "" if verdict.decision is Decision.USE else f"window: {'; '.join(verdict.reasons)}"
+        self._since_s = min(self._since_s, now)
+        ranked, rate = self._frames.push(now, measured), self._settings.false_alarm_rate
+        best, share = ranked[0], rate / len(ranked)
+        if best.p_value < share:
+            named = ", or ".join(str(suspicion) for suspicion in ranked if suspicion.p_value < RELIEF_P)
+            self._doubt = (
+                f"window: the frames of {now - self._since_s:.1f} s lean one way, as if {named} "
+                f"(p = {best.p_value:.1g} < {share:.1g})"
+            )
+        elif best.p_value >= RELIEF_P:
+            self._doubt = ""
+        if self._window is not None and now - self._looked_s >= self._spacing_s:
+            verdict = self._window.push(measured, self._moved)
+            self._looked_s, self._fresh = now, True
+            if verdict.decision is not Decision.NOT_MONITORED:
+                self._refusal = "" if verdict.decision is Decision.USE else f"window: {'; '.join(verdict.reasons)}"
 
 
 class _Belief(NamedTuple):

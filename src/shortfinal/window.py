@@ -9,8 +9,9 @@ of freedom.
 
 Errors are taken as independent from frame to frame. Where they are not, alarms come too often: at a
 correlation of 0.5 some thirty times, at 0.9 hundreds of times as often (benchmarks/window.py). Thin
-the frames (`every`), or inflate their covariance by (1 + ρ) / (1 - ρ). Frames, axes and units: the
-table of conventions in docs/architecture.md.
+the frames (`every`), or inflate their covariance by (1 + ρ) / (1 - ρ). Without odometry `FadingWindow`
+takes every frame, and allows for errors that persist. Frames, axes and units: the table of
+conventions in docs/architecture.md.
 """
 
 from __future__ import annotations
@@ -129,6 +130,11 @@ SUSPECTS = (
     Suspect("focal length", ("shorter", "longer"), zoom=1.0),
     Suspect("odometry", ("short", "long"), stride=1.0),
 )
+
+_ASKEW = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.5, 0.0, 0.0))
+# Those of which a frame's own residual tells. Four corners check two things (docs/limits.md): the far end's
+# width, given the near one's, which the first three change alike, and its slope.
+FRAME_SUSPECTS = (*SUSPECTS[:3], Suspect("far end", ("askew, left side short", "askew, right side short"), _ASKEW))
 
 
 @dataclass(frozen=True)
@@ -252,6 +258,61 @@ class IntegrityWindow:
         if not self._held or self._pushed >= self.every:
             self._held, self._since, self._pushed = frames, None, 0
         return verdict
+
+
+class FadingWindow:
+    """The directed tests of all frames so far, without motion between them, for errors that persist.
+
+    Of frame k let r be the whitened residual, and g what a suspect's unit does to it, with the pose
+    projected out. The score Σ w g·r, older frames weighing less by w = exp(-age / `memory_s`), is normal
+    with mean zero without a fault. If the errors of two frames Δt apart correlate by at most
+    exp(-Δt / `correlation_time_s`), in whatever combination of keypoints, then by Cauchy and Schwarz its
+    variance is at most ΣΣ w w' |g| |g'| exp(-Δt / correlation_time_s). That is what it is divided by:
+    faultless flights are suspected at most as often as p says.
+
+    Nothing is lost for want of a motion: with the velocity unknown, a model of smooth motion adds nothing
+    to what the residuals tell (docs/tracking.md). A fault that another pose explains is not seen.
+    """
+
+    def __init__(
+        self, correlation_time_s: float, memory_s: float = 30.0, suspects: Sequence[Suspect] = FRAME_SUSPECTS
+    ) -> None:
+        for name, value in (("correlation_time_s", correlation_time_s), ("memory_s", memory_s)):
+            if not (math.isfinite(value) and (value > 0 or (value == 0 and name == "correlation_time_s"))):
+                raise InputError(f"window: {name} is {value}; it must be finite and positive")
+        self.suspects = tuple(suspects)
+        self._tau_s, self._memory_s, self._last_s = correlation_time_s, memory_s, -math.inf
+        self._score, self._information, self._variance, self._alike = np.zeros((4, len(self.suspects)))
+
+    def push(self, timestamp_s: float, estimate: PoseEstimate) -> tuple[Suspicion, ...]:
+        """What all frames up to this one say of each suspect, the most suspicious first; times must advance.
+
+        One without a unique estimate says nothing.
+        """
+        if estimate.status is SolverStatus.CONVERGED:
+            passed, self._last_s = timestamp_s - self._last_s, timestamp_s
+            seen = _in_residual(estimate, self.suspects)
+            size = np.sqrt(np.sum(seen**2, axis=0))
+            fade = math.exp(-passed / self._memory_s)
+            self._alike *= fade * (math.exp(-passed / self._tau_s) if self._tau_s > 0 else 0.0)
+            self._score = fade * self._score + estimate.residual @ seen
+            self._information = fade * self._information + size**2
+            self._variance = fade**2 * self._variance + 2.0 * size * self._alike + size**2
+            self._alike += size
+        return self._suspicions()
+
+    def _suspicions(self) -> tuple[Suspicion, ...]:
+        found = []
+        for suspect, score, information, variance in zip(
+            self.suspects, self._score, self._information, self._variance, strict=True
+        ):
+            if information > 0:
+                statistic = float(score**2 / variance)
+                value, sigma = float(score / information), math.sqrt(variance) / float(information)
+                found.append(Suspicion(suspect, value, sigma, statistic, float(chdtrc(1, statistic))))
+            else:
+                found.append(Suspicion(suspect, 0.0, math.inf, 0.0, 1.0))
+        return tuple(sorted(found, key=lambda suspicion: -suspicion.statistic))
 
 
 class _Frames(NamedTuple):
@@ -414,6 +475,20 @@ def _stack(
             problem.translations[i], problem.turns[i] = motion.translation_m, motion.earlier_from_later
             problem.whitener[i] = np.linalg.inv(np.linalg.cholesky(motion.cov))
     return problem
+
+
+def _in_residual(estimate: PoseEstimate, suspects: Sequence[Suspect]) -> Array:
+    """What a unit of each suspect does to a frame's whitened residual (n, S), its pose projected out."""
+    assert estimate.pose is not None  # as it converged
+    problem = _stack([estimate], (), suspects)
+    state = _State(problem.frames.positions, problem.frames.rotations, np.zeros(len(suspects)))
+    rows = _frame_rows(problem, state)
+    assert rows is not None  # the solver's own pose has all points in front
+    effects = rows[0][0, :, 1:]
+    basis = np.linalg.qr(estimate.jacobian)[0]
+    seen = effects - basis @ (basis.T @ effects)
+    seen[:, np.sum(seen**2, axis=0) < _UNSEEN * np.sum(effects**2, axis=0)] = 0.0
+    return seen
 
 
 def _fit(problem: _Problem, start: _State | None = None, solve_parameters: bool = False) -> _Fit | None:

@@ -2,131 +2,164 @@
 
 from __future__ import annotations
 
-import json
 import math
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shortfinal.crops import centre_crop
 from shortfinal.errors import InputError, JobError
-from shortfinal.files import make_folder, write_whole
-from shortfinal.pipeline import FrameResult, LandingPipeline
+from shortfinal.geometry import Pose, project
+from shortfinal.keypoints import GaussianKeypoints
+from shortfinal.pipeline import ENDS, FrameResult, LandingPipeline
 from shortfinal.protection import AlertLimits
 from shortfinal.stream.frames import FrameSource, Mailbox, TimedFrame
-
-Image = NDArray[np.uint8]
+from shortfinal.stream.sink import Image, Lasting, Log, Prompt, Sink
+from shortfinal.tracker import Tracker
 
 WATCHDOG_S = 0.2  # without a frame, after which the flight is told so
-BUDGET_MS = 33.0  # from frame to result
-_PICTURE_PX = 960  # longer side of the copies of frames
+BUDGET_MS = 33.0  # from a frame's coming to its result's going out
+QUEUE = 8  # pictures that wait to be written
+BACKLOG = 3000  # results that do: when a disk hangs, these are 100 s at 30 frames/s
+_GAPS = 20  # gaps between frames that are noted one by one
 
 
-class Sink(Protocol):
-    """Where results go."""
-
-    def write(self, frame: int, result: FrameResult, image: Image | None = None) -> None:
-        """One frame's result. Raises InputError or JobError if it cannot be written any more."""
-
-    def close(self) -> None:
-        """Finish."""
-
-
-@dataclass
-class Log:
-    """What a flight's folder holds: flight.json, frames.jsonl (a line a frame, flushed), and copies of frames.
-
-    Readable at any moment as far as it goes, also after a SIGKILL.
+class Stages:
+    """How long each stage took, of every frame: counted in bins 2 % wide, so that an hour takes no more room than a
+    second, and a percentile is good to 1 %.
     """
 
-    folder: Path
-    flight: dict[str, Any]
-    every: int = 1  # of the frames a copy is kept of; 0: none
+    _FIRST_MS, _RATIO, _BINS = 1e-3, 1.02, 1100  # up to 48 minutes
 
-    def __post_init__(self) -> None:
-        make_folder(self.folder)
-        if self.every:
-            make_folder(self.folder / "frames")
-        for old in (self.folder / "frames").glob("*.jpg"):
-            old.unlink()
-        write_whole(self.folder / "flight.json", json.dumps(self.flight, indent=1) + "\n")
-        try:
-            self._lines = (self.folder / "frames.jsonl").open("wb", buffering=0)
-        except OSError as error:
-            raise InputError(f"{self.folder}/frames.jsonl: cannot be written: {error.strerror}") from error
-
-    def write(self, frame: int, result: FrameResult, image: Image | None = None) -> None:
-        """Append the line of a frame."""
-        record = {"frame": frame, **result.to_dict()}
-        try:
-            if image is not None and self.every and frame % self.every == 0:
-                name = f"frames/{frame:06d}.jpg"
-                content, scale = reduced_jpeg(image)
-                partial = self.folder / f"{name}.partial"
-                partial.write_bytes(content)
-                partial.replace(self.folder / name)
-                record |= {"image": name, "image_scale": scale}
-            line = json.dumps(record, allow_nan=False).encode() + b"\n"
-            if self._lines.write(line) != len(line):
-                raise OSError(28, "no space left on the device")
-        except OSError as error:
-            raise JobError(f"{self.folder}: cannot be written: {error.strerror or error}") from error
-
-    def close(self) -> None:
-        """Write flight.json as it has become."""
-        self._lines.close()
-        write_whole(self.folder / "flight.json", json.dumps(self.flight, indent=1) + "\n")
-
-
-def reduced_jpeg(image: Image) -> tuple[bytes, float]:
-    """A copy of a frame (h, w, 3; RGB) as JPEG, and its pixels over the frame's."""
-    scale = min(1.0, _PICTURE_PX / max(image.shape[:2]))
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
-    return cv2.imencode(".jpg", small[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes(), scale
-
-
-class Live:
-    """The replay page while the flight is on, at `url`."""
-
-    def __init__(self, flight: dict[str, Any]) -> None:
-        from shortfinal.view.live import LiveView
-
-        self._view = LiveView(flight)
-        self.url = self._view.url
-
-    def write(self, frame: int, result: FrameResult, image: Image | None = None) -> None:
-        """Show a frame."""
-        jpeg = None if image is None else reduced_jpeg(image)[0]
-        self._view.write({"frame": frame, **result.to_dict()}, jpeg)
-
-    def close(self) -> None:
-        """End it."""
-        self._view.close()
-
-
-@dataclass
-class Stages:
-    """How long each stage took, of every frame."""
-
-    times: dict[str, list[float]] = field(default_factory=dict)  # ms
+    def __init__(self) -> None:
+        self._counts: dict[str, NDArray[np.int64]] = {}
 
     def add(self, timings: dict[str, float]) -> None:
-        """Those of one frame."""
+        """Those of one frame, ms."""
         for stage, ms in timings.items():
-            self.times.setdefault(stage, []).append(ms)
+            place = math.log(max(ms, self._FIRST_MS) / self._FIRST_MS) / math.log(self._RATIO)
+            counts = self._counts.setdefault(stage, np.zeros(self._BINS, np.int64))
+            counts[min(int(place), self._BINS - 1)] += 1
 
     def summary(self) -> dict[str, dict[str, float]]:
         """p50, p95 and p99 of each stage, ms."""
         return {
-            stage: {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 95, 99)}
-            for stage, ms in self.times.items()
+            stage: {f"p{q}": round(self._percentile(counts, q), 3) for q in (50, 95, 99)}
+            for stage, counts in self._counts.items()
         }
+
+    def _percentile(self, counts: NDArray[np.int64], q: float) -> float:
+        """The middle of the bin that holds the smallest time which q % do not exceed."""
+        up_to = np.cumsum(counts)
+        place = int(np.searchsorted(up_to, up_to[-1] * q / 100))
+        return self._FIRST_MS * float(self._RATIO ** (place + 0.5))
+
+
+class Writer:
+    """Results to the sinks in a thread of its own: what is slow there does not hold up the flight.
+
+    Sinks that are `Prompt` are written at once instead, by whoever gives the result. Of the others' pictures at
+    most QUEUE wait. If the flight is `patient` it waits for them; else a picture that finds no room is dropped and
+    counted, and its result goes without. A sink that fails is left out, and noted.
+    """
+
+    def __init__(self, sinks: Sequence[Sink], *, patient: bool) -> None:
+        self.notes: list[str] = []
+        self.stages = Stages()
+        self.pictures_dropped = self.results_dropped = 0
+        self._patient, self._ended = patient, False
+        self._prompt: list[Sink] = [sink for sink in sinks if isinstance(sink, Prompt) and sink.prompt]
+        self._slow = [sink for sink in sinks if sink not in self._prompt]
+        self._losses: dict[int, tuple[int, int]] = {}  # of a lasting sink: the first and the last frame
+        self._waiting: deque[tuple[int, FrameResult, Image | None]] = deque()
+        self._pictures = 0  # of those that wait
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._work, name="sinks", daemon=True)
+        self._thread.start()
+
+    def give(self, frame: int, result: FrameResult, image: Image | None) -> float:
+        """One frame's result. Returns how long those took that are written at once, ms."""
+        start = time.perf_counter()
+        self._write(self._prompt, frame, result, image)
+        sent_ms = 1e3 * (time.perf_counter() - start)
+        with self._changed:
+            if self._patient:
+                self._changed.wait_for(lambda: len(self._waiting) < QUEUE)
+            elif len(self._waiting) >= BACKLOG:
+                self.results_dropped += 1
+                return sent_ms
+            elif image is not None and self._pictures >= QUEUE:
+                self.pictures_dropped += 1
+                image = None
+            self._waiting.append((frame, result, image))
+            self._pictures += image is not None
+            self._changed.notify_all()
+        return sent_ms
+
+    def drain(self) -> None:
+        """Write what waits, close the sinks but the log, and say what they lost."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        self._thread.join()
+        for sink in (*self._prompt, *self._slow):
+            if isinstance(sink, Lasting) and sink.errors:
+                first, last = self._losses.get(id(sink), (-1, -1))
+                name = type(sink).__name__
+                self.notes.append(f"{name}: {sink.errors} lost, frames {first} to {last}: {sink.note}")
+            if not isinstance(sink, Log):
+                self._close(sink)
+        if self.results_dropped:
+            self.notes.append(f"{self.results_dropped} results not written: the sinks were {BACKLOG} behind")
+
+    def finish(self, record: dict[str, Any]) -> None:
+        """Close the log with what has become of the flight."""
+        for sink in self._slow:
+            if isinstance(sink, Log):
+                sink.flight |= record
+                self._close(sink)
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._ended)
+                if not self._waiting:
+                    return
+                frame, result, image = self._waiting.popleft()
+                self._pictures -= image is not None
+                self._changed.notify_all()
+            start = time.perf_counter()
+            self._write(self._slow, frame, result, image)
+            self.stages.add({"write_ms": 1e3 * (time.perf_counter() - start)})
+
+    def _write(self, sinks: list[Sink], frame: int, result: FrameResult, image: Image | None) -> None:
+        for sink in list(sinks):
+            before = sink.errors if isinstance(sink, Lasting) else 0
+            try:
+                sink.write(frame, result, image)
+            except Exception as error:  # whatever it is, the flight goes on
+                self.notes.append(f"frame {frame}: {_words(error)}; left out from here on")
+                sinks.remove(sink)
+                self._close(sink)
+            if isinstance(sink, Lasting) and sink.errors > before:
+                self._losses[id(sink)] = (self._losses.get(id(sink), (frame, frame))[0], frame)
+
+    def _close(self, sink: Sink) -> None:
+        try:
+            sink.close()
+        except Exception as error:
+            self.notes.append(f"{type(sink).__name__}: {_words(error)}")
+
+
+def _words(error: Exception) -> str:
+    return str(error) if isinstance(error, (InputError, JobError)) else f"{type(error).__name__}: {error}"
 
 
 @dataclass(frozen=True)
@@ -138,8 +171,28 @@ class Flown:
     states: dict[str, int]  # of the track
     dropped: int  # frames that a newer one overtook
     misses: int  # results later than the budget
+    pictures_dropped: int  # that the sinks were too slow for
+    warm_up_s: float  # before the first frame
     stages: dict[str, dict[str, float]]
     notes: tuple[str, ...]  # what failed on the way
+
+
+@dataclass
+class _Count:
+    """What a flight counts."""
+
+    frames: int = 0
+    misses: int = 0
+    gaps: int = 0  # for which the watchdog barked
+    decisions: dict[str, int] = field(default_factory=dict)
+    states: dict[str, int] = field(default_factory=dict)
+
+    def add(self, result: FrameResult) -> None:
+        decision = result.verdict.decision.value
+        self.decisions[decision] = self.decisions.get(decision, 0) + 1
+        if result.track is not None:
+            state = result.track.state.value
+            self.states[state] = self.states.get(state, 0) + 1
 
 
 def fly(
@@ -156,58 +209,91 @@ def fly(
     """Every frame of a source through the pipeline, its results to the sinks.
 
     `box`: where the runway is in the first frame, if known. `newest`: of a source that does not wait, only the
-    newest frame is taken (default: if it is live). A sink that fails is left out and noted. Without a frame for
+    newest frame is taken (default: if it is live), and the flight does not wait for the sinks: pictures that they
+    are too slow for are dropped, results are not. A sink that fails is left out and noted. Without a frame for
     `watchdog_s` a live flight gets a result that says so, and its track coasts. A frame that cannot be processed is
-    a verdict of NOT_MONITORED. Raises what the source raises.
+    a verdict of NOT_MONITORED, but for the first one, of another size than the camera's, which is refused. Before it
+    all code is run once. Raises what the source raises, when all results are written.
     """
-    mailbox = Mailbox(source, newest=source.live if newest is None else newest)
-    open_sinks, stages, notes = list(sinks), Stages(), []
-    decisions: dict[str, int] = {}
-    states: dict[str, int] = {}
-    frames = misses = 0
+    latest = source.live if newest is None else newest
+    warm_up_s = warm_up(pipeline)
+    writer, mailbox = Writer(sinks, patient=not latest), Mailbox(source, newest=latest)
+    stages, count = Stages(), _Count()
     last = TimedFrame(-1, 0.0, np.zeros((1, 1, 3), np.uint8))
-    heard = time.monotonic()
+    heard, silent = time.monotonic(), False
 
-    def give(number: int, result: FrameResult, image: Image | None) -> None:
-        decisions[result.verdict.decision.value] = decisions.get(result.verdict.decision.value, 0) + 1
-        if result.track is not None:
-            states[result.track.state.value] = states.get(result.track.state.value, 0) + 1
-        for sink in list(open_sinks):
-            try:
-                sink.write(number, result, image)
-            except (InputError, JobError) as error:
-                notes.append(f"frame {number}: {error}; left out from here on")
-                open_sinks.remove(sink)
-                with suppress(InputError, JobError, OSError):
-                    sink.close()
+    def give(number: int, result: FrameResult, image: Image | None) -> float:
+        count.add(result)
+        sent_ms = writer.give(number, result, image)
         progress(number, result)
+        return sent_ms
 
     try:
         while True:
             frame = mailbox.take(watchdog_s if source.live else None)
             if frame is None and mailbox.ended:
                 break
+            quiet_s = time.monotonic() - heard
             if frame is None:
-                silent = time.monotonic() - heard
-                give(last.number, pipeline.coast(last.timestamp_s + silent, f"no frame for {silent:.1f} s"), None)
+                silent = True
+                give(last.number, pipeline.coast(last.timestamp_s + quiet_s, f"no frame for {quiet_s:.1f} s"), None)
                 continue
-            start = time.perf_counter()
-            result = pipeline.step(frame.image, frame.timestamp_s, box=box if frames == 0 else None)
-            elapsed_ms = 1e3 * (time.perf_counter() - start)
-            stages.add({**result.timings, "step_ms": elapsed_ms})
-            give(frame.number, result, frame.image)
-            stages.add({"write_ms": 1e3 * (time.perf_counter() - start) - elapsed_ms})
-            misses += elapsed_ms > budget_ms
-            frames, last, heard = frames + 1, frame, time.monotonic()
+            if silent:
+                silent, count.gaps = False, count.gaps + 1
+                if count.gaps <= _GAPS:
+                    writer.notes.append(f"frame {frame.number}: the first after {quiet_s:.1f} s without any")
+            waited_ms, start = mailbox.waited_ms if latest else 0.0, time.perf_counter()
+            image: Image | None = frame.image
+            try:
+                result = pipeline.step(frame.image, frame.timestamp_s, box=box if count.frames == 0 else None)
+            except InputError as error:
+                if count.frames == 0:  # then it is the camera's file that is wrong
+                    raise
+                result, image = pipeline.coast(frame.timestamp_s, str(error)), None
+            step_ms = 1e3 * (time.perf_counter() - start)
+            total_ms = waited_ms + step_ms + give(frame.number, result, image)
+            stages.add({**result.timings, "step_ms": step_ms, "total_ms": total_ms})
+            count.misses += total_ms > budget_ms
+            count.frames, last, heard = count.frames + 1, frame, time.monotonic()
     finally:
         mailbox.close()
-        summary = stages.summary()
-        for sink in open_sinks:
-            if isinstance(sink, Log):
-                sink.flight |= {"stages": summary, "dropped": mailbox.dropped, "misses": misses, "notes": notes}
-            with suppress(OSError):
-                sink.close()
-    return Flown(frames, decisions, states, mailbox.dropped, misses, summary, tuple(notes))
+        writer.drain()
+        if count.gaps > _GAPS:
+            writer.notes.append(f"{count.gaps - _GAPS} more gaps between frames")
+        summary = stages.summary() | writer.stages.summary()
+        writer.finish({
+            "stages": summary, "dropped": mailbox.dropped, "misses": count.misses,
+            "pictures_dropped": writer.pictures_dropped, "warm_up_s": warm_up_s, "notes": writer.notes,
+        })  # fmt: skip
+    return Flown(
+        count.frames, count.decisions, count.states, mailbox.dropped, count.misses, writer.pictures_dropped, warm_up_s,
+        summary, tuple(writer.notes),
+    )  # fmt: skip
+
+
+def warm_up(pipeline: LandingPipeline) -> float:
+    """Run what a flight runs once, on a picture of noise and on a runway that is seen, so that no frame pays for what
+    is compiled, loaded or allocated at first use. The pipeline itself stays as it is. Returns the seconds it took.
+    """
+    start = time.perf_counter()
+    camera, detector = pipeline.camera, pipeline.detector
+    tracker = None if pipeline.tracker is None else Tracker()
+    other = LandingPipeline(detector, pipeline.runway, camera, further_points=pipeline.points[4:], tracker=tracker)
+    with suppress(InputError):  # a camera that cannot see it from there
+        pose = Pose.from_attitude([-1500.0, 0.0, 80.0], pitch_deg=-3.0)
+        keypoints = GaussianKeypoints.from_sigma(project(camera, pose, other.points), 0.5)
+        for frame in range(10):  # enough for a track
+            estimate, verdict, _ = other.judge(keypoints, points=other.points)
+            if other.tracker is not None:
+                other.tracker.update(frame / 30, estimate, verdict)
+    noise = np.random.default_rng(0).integers(0, 256, (camera.height, camera.width, 3), np.uint8)
+    size = np.array([camera.width, camera.height])
+    middle = np.concatenate([0.4 * size, 0.6 * size])
+    for box in (None, middle):
+        other.step(noise, 1.0, box=box)
+    with suppress(InputError):  # a network that makes nothing of noise
+        detector.look_all(noise, [centre_crop(middle, detector.info.margin, detector.info.size)] * len(ENDS))
+    return time.perf_counter() - start
 
 
 def flight_record(
@@ -227,4 +313,5 @@ def flight_record(
             "fault_prior": pipeline.fault_prior,
         },
         "alert_limits": bounds, "stages": None, "dropped": 0, "budget_ms": budget_ms, "misses": 0,
+        "pictures_dropped": 0, "warm_up_s": None, "notes": [],
     }  # fmt: skip

@@ -22,7 +22,9 @@ from shortfinal.geometry import Camera
 Image = NDArray[np.uint8]
 
 FPS = 30.0  # of a source that does not say
-RETRY_S = 0.5  # between attempts to open a camera or stream again that is gone
+RETRY_S = 0.25  # between attempts to open a camera or stream again that is gone
+SILENT_MS = 500  # after which a stream that sends nothing counts as gone: its connection may be dead
+OPEN_MS = 3000  # a stream may take to open; it has to come to a whole picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +33,7 @@ class TimedFrame:
 
     number: int  # in the source, from 0; frames that were dropped have theirs
     timestamp_s: float  # of a live source: when it came in, on the monotonic clock, from the start
-    image: Image  # (h, w, 3) RGB
+    image: Image  # (h, w, 3) RGB; not written to again
 
 
 class FrameSource(Protocol):
@@ -113,7 +115,7 @@ class VideoSource:
 
 
 class LiveSource:
-    """A camera or a stream. One that is gone is opened again until it is back; `stop` ends it."""
+    """A camera or a stream. One that is gone, or silent, is opened again until it is back; `stop` ends it."""
 
     live = True
 
@@ -127,14 +129,18 @@ class LiveSource:
         self._video = self._open()
         if self._video is None:
             raise InputError(f"{text}: cannot be opened; is it there, and free?")
-        self.lost = 0  # how often it went away
 
     def stop(self) -> None:
         """End it from another thread."""
         self._stopped.set()
 
     def _open(self) -> cv2.VideoCapture | None:
-        video = cv2.VideoCapture(self._name)
+        if isinstance(self._name, int):
+            video = cv2.VideoCapture(self._name)
+        else:
+            waits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, OPEN_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, SILENT_MS]
+            # More than one thread would hold back a picture for each.
+            video = cv2.VideoCapture(self._name, cv2.CAP_FFMPEG, [*waits, cv2.CAP_PROP_N_THREADS, 1])
         return video if video.isOpened() else None
 
     def __iter__(self) -> Iterator[TimedFrame]:
@@ -145,7 +151,6 @@ class LiveSource:
                 yield TimedFrame(number, time.monotonic() - start, _rgb(picture))
                 number += 1
                 continue
-            self.lost += self._video is not None
             self._video = None
             self._stopped.wait(RETRY_S)
             self._video = self._open()
@@ -180,6 +185,7 @@ class Mailbox:
         self._frame: TimedFrame | None = None
         self._error: BaseException | None = None
         self._ended = self._stopped = False
+        self._came_s = self.waited_ms = 0.0  # when the frame came; how long the last one that was taken had lain here
         self._ready = threading.Condition()
         self.dropped = 0
         self._thread = threading.Thread(target=self._read, name="frames", daemon=True)
@@ -190,6 +196,7 @@ class Mailbox:
         with self._ready:
             self._ready.wait_for(lambda: self._frame is not None or self._ended, timeout_s)
             frame, self._frame = self._frame, None
+            self.waited_ms = 1e3 * (time.monotonic() - self._came_s)
             self._ready.notify_all()
             if frame is None and self._error is not None:
                 error, self._error = self._error, None
@@ -219,7 +226,7 @@ class Mailbox:
                     if self._stopped:
                         return
                     self.dropped += self._frame is not None
-                    self._frame = frame
+                    self._frame, self._came_s = frame, time.monotonic()
                     self._ready.notify_all()
         except BaseException as error:
             self._error = error

@@ -31,7 +31,7 @@ from shortfinal.tracker import Track, TrackState
 Array = NDArray[np.float64]
 
 HEARTBEAT_S = 1.0  # between heartbeats, and at least so long between status texts, by the frames' timestamps
-RETRY_S = 1.0  # between attempts to open a serial line that is gone, by the clock on the wall
+RETRY_S = 0.25  # between attempts to open a serial line that is gone, by the clock on the wall
 LONGEST_TEXT = 200  # characters of a status text
 
 _FRD = np.diag([1.0, -1.0, -1.0])  # forward, left, up to forward, right, down, and back
@@ -53,6 +53,8 @@ class MavlinkSink:
     go out. A peer that is gone neither stops nor delays a flight: nothing waits, `errors` counts what
     was not sent, `note` says why, and sending goes on when the peer is back.
     """
+
+    prompt = True  # a flight writes it first, in its own thread
 
     def __init__(self, connection: str, *, system: int = 1, target_m: ArrayLike | None = (0.0, 0.0, 0.0)) -> None:
         """`connection`: "udpout:HOST:PORT" or "/dev/DEVICE:BAUD"; `system`: the vehicle's id; `target_m` (3,): the
@@ -313,7 +315,8 @@ class _Serial:
         except BlockingIOError:
             raise BlockingIOError(None, f"{self._path}: the line takes no more; raise its baud rate") from None
         except OSError:
-            self._drop()
+            if self._fd is not None:
+                self._drop()
             raise
 
     def close(self) -> None:

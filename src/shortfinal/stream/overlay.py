@@ -163,6 +163,12 @@ def _draw_text(canvas: Image, result: FrameResult, notes: Notes) -> Image:
         draw.text((x + 72, y), value, fill=_INK, font=_font(14, bold=True))
         draw.text((x + _PANEL - 4, y), error, fill=_DIM, font=_font(13), anchor="ra")
         y += 24
+    if result.track is not None:
+        draw.text((x, y + 6), f"track: {result.track.state.value}", fill=_INK, font=_font(14, bold=True))
+        for line in textwrap.wrap(result.track.reason, 46)[:2]:
+            y += 18
+            draw.text((x, y + 6), line, fill=_DIM, font=_font(12))
+        y += 22
     for line in textwrap.wrap(notes.fault, 42):
         draw.text((x, y + 6), line, fill=_AMBER, font=_font(13, bold=True))
         y += 19

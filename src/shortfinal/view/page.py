@@ -24,6 +24,8 @@ from shortfinal.protection import AXES, GLIDE_PATH_ORIGIN_M
 
 FORMAT = 1  # of flight.json
 GLIDE_PATH_DEG = 3.0
+LOCALIZER_DDM, LOCALIZER_DDM_PER_M, LARGEST_LATERAL_DEG = 0.155, 0.00145, 3.0
+HALF_SCALE = 0.12  # of the glide path's angle
 DECISIONS = ("use", "do-not-use", "not-monitored")
 STATES = ("searching", "tracking", "degraded", "lost")
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
@@ -109,7 +111,7 @@ def page_html(flight: Mapping[str, Any], columns: Columns, notes: list[str], liv
         "live": live,
         "notes": notes,
         "glide_path": {"deg": GLIDE_PATH_DEG, "origin_m": GLIDE_PATH_ORIGIN_M},
-        "end_m": runway_end_m(flight),
+        "full_scale_deg": full_scale_deg(runway_end_m(flight)),
         **columns.packed(),
     }
     script = _template("replay.js")
@@ -153,6 +155,17 @@ def check_flight(flight: Any, name: str) -> dict[str, Any]:
 def runway_end_m(flight: Mapping[str, Any]) -> float:
     """Where the runway ends, x of the runway frame: a localizer's antenna stands there (protection.py)."""
     return max(float(corner[0]) for corner in flight["runway"]["corners_m"])
+
+
+def full_scale_deg(end_m: float) -> dict[str, float]:
+    """Deviations at which the needles stand at two dots, 150 µA; the localizer's antenna `end_m` past the threshold.
+
+    ICAO Annex 10, vol. I. 3.1.3.7.1: 0.00145 DDM a metre at the threshold; the course sector ends at 0.155 DDM
+    to either side, and is 6 degrees wide at most. 3.1.5.6: 0.0875 DDM, half the scale, at 0.12 of the glide path's
+    angle.
+    """
+    lateral = math.degrees(math.atan2(LOCALIZER_DDM / LOCALIZER_DDM_PER_M, end_m))
+    return {"lateral": min(lateral, LARGEST_LATERAL_DEG), "vertical": 2 * HALF_SCALE * GLIDE_PATH_DEG}
 
 
 def row_of(record: Mapping[str, Any], end_m: float) -> Row:

@@ -12,8 +12,7 @@ const DRAWN = {"use": "#40dc6e", "do-not-use": "#ff483c", "not-monitored": "#ffb
 const GAP_S = 1, LONGEST_S = 30; // a curve breaks over a longer gap; the time axis shows none longer
 const PICTURES_KEPT = 80, AHEAD = 8;
 const DEG = Math.PI / 180;
-// ICAO Annex 10 vol. I, 3.1.3.7 and 3.1.5.6: full scale of the localizer at the threshold, and of the glide path.
-const LOC_FULL_DEG = Math.min(3, Math.atan2(107, given.end_m) / DEG), GS_FULL_DEG = 0.24 * given.glide_path.deg;
+const LOC_FULL_DEG = given.full_scale_deg.lateral, GS_FULL_DEG = given.full_scale_deg.vertical;
 
 // --- the flight as columns; a live one grows
 
