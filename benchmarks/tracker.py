@@ -25,10 +25,10 @@ from scipy.stats import chi2
 
 import shortfinal as sf
 import shortfinal.tracker as tracker_module
-from shortfinal.integrity import IntegrityVerdict
+from shortfinal.integrity import Decision, IntegrityVerdict
 from shortfinal.pose import PoseEstimate, estimate_pose_batch
 from shortfinal.tracker import Track, Tracker, TrackerSettings, TrackState
-from shortfinal.window import RelativeMotion
+from shortfinal.window import FadingWindow, RelativeMotion
 
 Array = NDArray[np.float64]
 
@@ -56,6 +56,7 @@ class Noise:
     sigma_px: tuple[float, float] = (0.5, 1.0)  # of each coordinate of each flight, uniform
     spread: float = 0.0  # of log sigma from frame to frame: a network's sigmas are never twice the same
     inflation: float = 1.0  # of the covariance that the estimates are told
+    full: bool = False  # the keypoints' errors correlate, differently in each frame
 
 
 def truth(
@@ -112,8 +113,13 @@ def measure(
         unit[k] = np.sqrt(noise.share) * slow + np.sqrt(1 - noise.share) * unit[k]
     sigma = rng.uniform(*noise.sigma_px, 8) * np.exp(noise.spread * rng.normal(size=(count, 8)))
     seen = np.array([sf.project(camera, pose, image.corners) for pose in poses])
-    cov = noise.inflation * sigma[:, :, None] ** 2 * np.eye(8)
-    batch = estimate_pose_batch(seen + (sigma * unit).reshape(-1, 4, 2), cov, runway.corners, CAMERA, threads=1)
+    root = sigma[:, :, None] * np.eye(8)
+    if noise.full:
+        mixed = rng.normal(size=(count, 8, 8))
+        mixed /= np.linalg.norm(mixed, axis=2, keepdims=True)
+        root = root @ np.linalg.cholesky(0.8 * mixed @ np.swapaxes(mixed, 1, 2) + 0.2 * np.eye(8))
+    error, cov = (root @ unit[:, :, None]).reshape(-1, 4, 2), noise.inflation * root @ np.swapaxes(root, 1, 2)
+    batch = estimate_pose_batch(seen + error, cov, runway.corners, CAMERA, threads=1)
     estimates = [batch[k] for k in range(count)]
     return estimates, [sf.check_integrity(est) for est in estimates]
 
@@ -409,7 +415,7 @@ def watched(rng: np.random.Generator, fault: Fault, length_m: float, noise: Nois
     return np.array(rows, np.float64)
 
 
-def watching(flights: int, seed: int, rate_hz: float = 10.0) -> list[dict[str, Any]]:
+def watching(flights: int, seed: int, rate_hz: float = 5.0) -> list[dict[str, Any]]:
     """Share of approaches on which the window has degraded the track by then, and on which anything has."""
     rows = []
     for length, sigma, aid in product((1500.0, 3000.0), (0.3, 0.8), (False, True)):
@@ -442,6 +448,36 @@ def _worst_unseen(flown: Array) -> float:
     """Largest error of position (m) within 1 km while TRACKING; 0 if it never is."""
     near = flown[(flown[:, 0] < 1000.0) & (flown[:, 1] > 0), 3]
     return float(near.max()) if len(near) else 0.0
+
+
+def alarms(flights: int, seed: int, rate: float = 0.01) -> list[dict[str, Any]]:
+    """Share of faultless approaches that the window of residuals, told 2 s, suspects: at their end, and at any time.
+
+    Twice a second, on a 1,500 m runway; at `rate`, large enough to count, and at any time at a tenth of it.
+    """
+    start, end = WATCHED_M
+    times = np.arange(0.0, (start - end) / WATCHED_MPS, 0.5)
+    rows = []
+    for (share, time_s, spread), full in product(((1, 2, 0), (1, 2, 0.4), (0.5, 0.5, 0), (1, 10, 0)), (False, True)):
+        rng, least = np.random.default_rng(seed), []
+        for _ in range(flights):
+            poses, _ = truth(rng, times, start, steered=True, speed_mps=WATCHED_MPS)
+            estimates, verdicts = measure(rng, times, poses, Noise(share, time_s, spread=spread, full=full))
+            window = FadingWindow(2.0)
+            p = [
+                window.push(float(t), est)[0].p_value
+                for t, est, verdict in zip(times, estimates, verdicts, strict=True)
+                if verdict.decision is Decision.USE
+            ]
+            least.append((p[-1], min(p)))
+        suspected = np.array(least) * len(window.suspects)
+        rows.append({
+            "share": share, "persists_s": time_s, "spread": spread, "full": full, "rate": rate,
+            "end": float(np.mean(suspected[:, 0] < rate)),
+            "any": float(np.mean(suspected[:, 1] < rate)),
+            "any_at_a_tenth": float(np.mean(suspected[:, 1] < 0.1 * rate)),
+        })  # fmt: skip
+    return rows
 
 
 def accuracy(flights: int, seed: int) -> list[dict[str, Any]]:
@@ -514,6 +550,14 @@ def _print(record: dict[str, Any]) -> None:
         shares = (f"{row[key]:.1%}" for key in ("position", "all", "least"))
         table.add_row(f"{row['persists_s']:g}", f"{row['correlation_time_s']:g}", *shares)
     console.print(table)
+    table = Table(
+        "share", "persists s", "σ changes by", "full Σ", "suspected at 1 %: at the end, ever", "ever at 0.1 %"
+    )
+    for row in record["alarms"]:
+        found = f"{row['end']:.2%} {row['any']:.2%}", f"{row['any_at_a_tenth']:.2%}"
+        setting = (f"{row['share']:g}", f"{row['persists_s']:g}", f"{row['spread']:g}", "yes" if row["full"] else "-")
+        table.add_row(*setting, *found)
+    console.print(table)
     table = Table("fault", "runway m", "σ px", "velocity", "window: by 2, 1, 0.5, 0.3 km", "not tracking", "unseen m")
     for row in record["watching"]:
         shares = (" ".join(f"{x:.0%}" for x in row[key]) for key in ("window", "any"))
@@ -543,7 +587,8 @@ def main() -> None:
         "jumps": smallest_jumps(given.seed),
         "turn": manoeuvre(given.seed),
         "endurance": endurance(2 * given.approaches, given.seed),
-        "watching": watching(4 * given.approaches, given.seed),
+        "alarms": alarms(4 * given.flights, given.seed),
+        "watching": watching(2 * given.approaches, given.seed),
         "accuracy": accuracy(given.approaches, given.seed),
     }
     if given.json:

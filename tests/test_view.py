@@ -21,6 +21,7 @@ from shortfinal.view.page import DECISIONS, full_scale_deg, row_of, write_replay
 CAMERA = sf.Camera(640, 480, 1300.0, 1300.0, 319.5, 239.5, (-0.1, 0.02, 0.001, -0.001))
 RUNWAY = sf.Runway(1500.0, 45.0, "TEST/09")
 FRAMES, STEP_S, BEGIN_S = 120, 0.1, 1000.0
+END_M = RUNWAY.length_m
 SIGMA_PX = 0.3
 LIMITS = {"along_m": 40.0, "cross_m": 40.0, "vertical_m": 35.0}
 FAULTY, BLIND = range(40, 50), range(70, 77)  # one corner locked elsewhere; nothing seen
@@ -327,6 +328,17 @@ def check_shown(page, record):
         assert rows[1][0].split()[-3 if "±" in rows[1][0] else -1] == ("L" if position[1] >= 0 else "R")
         sigma = math.sqrt(record["pose_cov"][2][2])
         assert float(rows[2][0].split("±")[1]) == pytest.approx(2 * sigma, abs=0.051)
+    best = position if track is None else track
+    for needle, name in (("loc", "lateral"), ("gs", "vertical")):
+        shown = page.evaluate("id => document.getElementById(id).innerText", needle)
+        if best is None:
+            assert shown.endswith("–")
+        else:
+            angle = row_of(
+                {"timestamp_s": 0.0, "decision": "use", "position_m": best, "attitude_deg": [0, 0, 0]}, END_M
+            )
+            expected = 2 * abs(angle.numbers[name]) / full_scale_deg(END_M)[name]
+            assert float(shown.split("(")[1].split()[0]) == pytest.approx(expected, abs=0.051)
 
 
 def test_keys_step_through_the_frames_and_the_figures_are_those_of_the_file(opened, replay, records):

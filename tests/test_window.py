@@ -473,7 +473,7 @@ def faded(estimates, time_s=TAU_S):
 
 
 @lru_cache
-def approaches(full, time_s, taken_s=TAU_S, count=200):
+def approaches(full, time_s, taken_s=TAU_S, count=120):
     """Least p of the suspects at the end of faultless approaches of 12 s, sigma changing from frame to frame."""
     rng, found = np.random.default_rng([full, 40]), []
     for _ in range(count):

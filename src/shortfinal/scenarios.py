@@ -38,8 +38,9 @@ from shortfinal.pipeline import FrameResult, LandingPipeline
 from shortfinal.runway import Runway
 from shortfinal.scene.render import render
 from shortfinal.scene.sensor import Sensor, expose
-from shortfinal.stream.fly import BUDGET_MS, Log, Sink, flight_record, fly
+from shortfinal.stream.fly import BUDGET_MS, flight_record, fly
 from shortfinal.stream.frames import LiveSource, TimedFrame
+from shortfinal.stream.sink import Log, Sink
 from shortfinal.tracker import Tracker, TrackState
 
 Array = NDArray[np.float64]

@@ -483,7 +483,8 @@ def _in_residual(estimate: PoseEstimate, suspects: Sequence[Suspect]) -> Array:
     problem = _stack([estimate], (), suspects)
     state = _State(problem.frames.positions, problem.frames.rotations, np.zeros(len(suspects)))
     rows = _frame_rows(problem, state)
-    assert rows is not None  # the solver's own pose has all points in front
+    if rows is None:  # a point behind the camera: nothing to be told
+        return np.zeros((len(estimate.residual), len(suspects)))
     effects = rows[0][0, :, 1:]
     basis = np.linalg.qr(estimate.jacobian)[0]
     seen = effects - basis @ (basis.T @ effects)
