@@ -223,6 +223,20 @@ def test_a_frame_that_cannot_be_read_ends_the_flight_with_what_was_written(folde
     assert len((tmp_path / "out" / "frames.jsonl").read_text().splitlines()) == 3
 
 
+def test_a_frame_of_another_size_is_no_measurement_and_the_next_one_is_again(folder, detector, tmp_path):
+    for k in range(4):
+        picture = cv2.imread(str(folder / f"{k:03d}.png"))
+        cv2.imwrite(str(tmp_path / f"{k}.png"), cv2.resize(picture, None, fx=0.5, fy=0.5) if k == 2 else picture)
+    kept = Kept()
+    fly(FolderSource(tmp_path, 10.0), pipeline_of(detector), [kept], box=BOX)
+    decisions = [result.verdict.decision for _, result in kept.records]
+    assert decisions == [sf.Decision.USE, sf.Decision.USE, sf.Decision.NOT_MONITORED, sf.Decision.USE]
+    assert "480 x 360 pixels; the camera has 960 x 720" in kept.records[2][1].verdict.reasons[0]
+    (tmp_path / "0.png").write_bytes((tmp_path / "2.png").read_bytes())
+    with pytest.raises(InputError, match="480 x 360"):
+        fly(FolderSource(tmp_path, 10.0), pipeline_of(detector), [], box=BOX)
+
+
 def arguments(folder, tmp_path):
     lens = tmp_path / "camera.toml"
     names = ("width", "height", "fx", "fy", "cx", "cy")

@@ -212,8 +212,10 @@ def fly(
     newest frame is taken (default: if it is live), and the flight does not wait for the sinks: pictures that they
     are too slow for are dropped, results are not. A sink that fails is left out and noted. Without a frame for
     `watchdog_s` a live flight gets a result that says so, and its track coasts. A frame that cannot be processed is
-    a verdict of NOT_MONITORED. Before the first frame all code is run once. Raises what the source raises, when all
-    results are written.
+    a verdict of NOT_MONITORED. Before the first frame all code is run once.
+
+    Raises what the source raises, when all results are written; InputError if the first frame is not of the camera's
+    size.
     """
     latest = source.live if newest is None else newest
     warm_up_s = warm_up(pipeline)
@@ -243,9 +245,15 @@ def fly(
                 if count.gaps <= _GAPS:
                     writer.notes.append(f"frame {frame.number}: the first after {quiet_s:.1f} s without any")
             waited_ms, start = mailbox.waited_ms if latest else 0.0, time.perf_counter()
-            result = pipeline.step(frame.image, frame.timestamp_s, box=box if count.frames == 0 else None)
+            image: Image | None = frame.image
+            try:
+                result = pipeline.step(frame.image, frame.timestamp_s, box=box if count.frames == 0 else None)
+            except InputError as error:  # of another size, or without a time
+                if count.frames == 0:  # it is the camera's file that is wrong
+                    raise
+                result, image = pipeline.coast(frame.timestamp_s, str(error)), None
             step_ms = 1e3 * (time.perf_counter() - start)
-            total_ms = waited_ms + step_ms + give(frame.number, result, frame.image)
+            total_ms = waited_ms + step_ms + give(frame.number, result, image)
             stages.add({**result.timings, "step_ms": step_ms, "total_ms": total_ms})
             count.misses += total_ms > budget_ms
             count.frames, last, heard = count.frames + 1, frame, time.monotonic()
