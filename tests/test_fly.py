@@ -13,6 +13,7 @@ import time
 from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
+from urllib.request import urlopen
 
 import cv2
 import flights
@@ -27,9 +28,10 @@ from shortfinal.scene.render import render
 from shortfinal.scene.sensor import Sensor
 from shortfinal.stream.fly import QUEUE, Stages, Writer, flight_record, fly, warm_up
 from shortfinal.stream.frames import FolderSource, LiveSource, Mailbox, PipeSource, TimedFrame, VideoSource, open_source
-from shortfinal.stream.sink import AnnotatedVideo, Log
+from shortfinal.stream.sink import AnnotatedVideo, Live, Log
 
 FRAMES = 8
+BENCHMARK = "flight_memory"
 
 
 @pytest.fixture(scope="module")
@@ -219,6 +221,20 @@ def test_a_frame_that_cannot_be_read_ends_the_flight_with_what_was_written(folde
     with pytest.raises(InputError, match=r"003\.png"):
         fly(FolderSource(bad, 10.0), pipeline_of(detector), [log], box=BOX)
     assert len((tmp_path / "out" / "frames.jsonl").read_text().splitlines()) == 3
+
+
+def test_a_frame_of_another_size_is_no_measurement_and_the_next_one_is_again(folder, detector, tmp_path):
+    for k in range(4):
+        picture = cv2.imread(str(folder / f"{k:03d}.png"))
+        cv2.imwrite(str(tmp_path / f"{k}.png"), cv2.resize(picture, None, fx=0.5, fy=0.5) if k == 2 else picture)
+    kept = Kept()
+    fly(FolderSource(tmp_path, 10.0), pipeline_of(detector), [kept], box=BOX)
+    decisions = [result.verdict.decision for _, result in kept.records]
+    assert decisions == [sf.Decision.USE, sf.Decision.USE, sf.Decision.NOT_MONITORED, sf.Decision.USE]
+    assert "480 x 360 pixels; the camera has 960 x 720" in kept.records[2][1].verdict.reasons[0]
+    (tmp_path / "0.png").write_bytes((tmp_path / "2.png").read_bytes())
+    with pytest.raises(InputError, match="480 x 360"):
+        fly(FolderSource(tmp_path, 10.0), pipeline_of(detector), [], box=BOX)
 
 
 def arguments(folder, tmp_path):
@@ -421,6 +437,22 @@ def test_a_peer_that_is_not_there_is_noted(folder, detector):
     assert note.endswith("refused")
 
 
+def test_a_browser_that_leaves_does_not_end_the_live_page(folder, detector):
+    pipeline = pipeline_of(detector)
+    live = Live(flight_record("folder", pipeline, {}, sf.AlertLimits(vertical_m=35.0), 33.0))
+    events = urlopen(f"{live.url}events")
+
+    def leave(frame, result):
+        if frame == 2:
+            assert b'"decision"' in events.readline()
+            events.close()
+
+    kept = Kept()
+    flown = fly(FolderSource(folder, 10.0), pipeline, [live, kept], box=BOX, progress=leave)
+    assert len(kept.records) == FRAMES
+    assert flown.notes == ()
+
+
 class Camera:
     """A network camera: JPEG pictures over HTTP, one after the other, at 10 a second."""
 
@@ -528,6 +560,27 @@ def test_percentiles_of_an_hour_are_good_to_a_percent():
     stages.add({"odd_ms": 0.0})
     stages.add({"odd_ms": 1e9})
     assert stages.summary()["odd_ms"]["p50"] == pytest.approx(1e-3, abs=6e-4)
+
+
+@pytest.mark.parametrize(("leak_kb", "flat"), [(0.0, True), (1.0, False)])
+def test_memory_that_grows_is_told_from_memory_that_varies(benchmark, leak_kb, flat):
+    frames = np.arange(1000, 20_001, 1000)
+    warm = 300 - 80 * np.exp(-frames / 1000)
+    noise = np.random.default_rng(2).normal(0, 0.5, len(frames))
+    found = benchmark.verdict(frames, warm + noise + leak_kb / 1024 * frames)
+    assert found["flat"] is flat
+    # Of 15,000 frames, give or take 0.5 MB times sqrt(12 / 15): three sigma and what the pools leave.
+    assert found["rise_mb"] == pytest.approx(15_000 * leak_kb / 1024, abs=2.0)
+
+
+@pytest.mark.slow
+def test_the_memory_of_a_flight_is_read(benchmark, tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark, "PICTURES", 2)
+    found = benchmark.measure(40, 5, 10, tmp_path)
+    assert found["frames"] == list(range(5, 41, 5))
+    assert sum(found["decisions"].values()) == len((tmp_path / "frames.jsonl").read_text().splitlines()) == 40
+    assert found["states"]["tracking"] > 20
+    assert found["notes"] == ()
 
 
 def test_a_warm_up_leaves_the_pipeline_as_it_was(pictures, detector):

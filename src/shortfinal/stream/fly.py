@@ -208,12 +208,18 @@ def fly(
 ) -> Flown:
     """Every frame of a source through the pipeline, its results to the sinks.
 
-    `box`: where the runway is in the first frame, if known. `newest`: of a source that does not wait, only the
-    newest frame is taken (default: if it is live), and the flight does not wait for the sinks: pictures that they
-    are too slow for are dropped, results are not. A sink that fails is left out and noted. Without a frame for
-    `watchdog_s` a live flight gets a result that says so, and its track coasts. A frame that cannot be processed is
-    a verdict of NOT_MONITORED, but for the first one, of another size than the camera's, which is refused. Before it
-    all code is run once. Raises what the source raises, when all results are written.
+        `box`: where the runway is in the first frame, if known. `newest`: of a source that does not wait, only the
+        newest frame is taken (default: if it is live), and the flight does not wait for the sinks: pictures that they
+        are too slow for are dropped, results are not. A sink that fails is left out and noted. Without a frame for
+        `watchdog_s` a live flight gets a result that says so, and its track coasts. A frame that cannot be processed is
+    <<<<<<< HEAD
+        a verdict of NOT_MONITORED, but for the first one, of another size than the camera's, which is refused. Before it
+        all code is run once. Raises what the source raises, when all results are written.
+    =======
+        a verdict of NOT_MONITORED. Before the first frame all code is run once.
+
+        Raises what the source raises, when all results are written; InputError if the first frame is not of the camera's
+        size.
     """
     latest = source.live if newest is None else newest
     warm_up_s = warm_up(pipeline)
@@ -246,8 +252,8 @@ def fly(
             image: Image | None = frame.image
             try:
                 result = pipeline.step(frame.image, frame.timestamp_s, box=box if count.frames == 0 else None)
-            except InputError as error:
-                if count.frames == 0:  # then it is the camera's file that is wrong
+            except InputError as error:  # of another size, or without a time
+                if count.frames == 0:  # it is the camera's file that is wrong
                     raise
                 result, image = pipeline.coast(frame.timestamp_s, str(error)), None
             step_ms = 1e3 * (time.perf_counter() - start)
