@@ -34,8 +34,9 @@ from shortfinal.demo import RUNWAY, demo_scene
 from shortfinal.integrity import Decision
 from shortfinal.pipeline import FrameResult
 from shortfinal.scene.render import render
-from shortfinal.stream.fly import Flown, fly
+from shortfinal.stream.fly import BUDGET_MS, Flown, flight_record, fly
 from shortfinal.stream.frames import TimedFrame, VideoSource
+from shortfinal.stream.sink import Log, Sink
 from shortfinal.tracker import Tracker
 
 Array = NDArray[np.float64]
@@ -202,12 +203,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=Path, required=True, help="folder of the frames, made if they are not there")
     parser.add_argument("--model", type=Path, help="model file; the one that ships by default")
+    parser.add_argument("--integrity-risk", type=float, default=1e-3, help="of the protection levels")
+    parser.add_argument("--out", type=Path, help="folder of the flight's record, for shortfinal view")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     video = make(options.frames)
-    pipeline = sf.LandingPipeline(sf.KeypointDetector(options.model), RUNWAY, CAMERA, tracker=Tracker())
+    pipeline = sf.LandingPipeline(
+        sf.KeypointDetector(options.model), RUNWAY, CAMERA, tracker=Tracker(), integrity_risk=options.integrity_risk
+    )
     kept = Kept()
-    flown = fly(Paced(VideoSource(video, None)), pipeline, [kept])
+    sinks: list[Sink] = [kept]
+    if options.out:
+        model = {"name": "the model that ships", "sha256": pipeline.detector.sha256}
+        sinks.append(Log(options.out, flight_record("approach.avi", pipeline, model, None, BUDGET_MS), every=3))
+    flown = fly(Paced(VideoSource(video, None)), pipeline, sinks)
     found = next((n for n, (_, r) in enumerate(kept.results, 1) if r.verdict.decision is Decision.USE), None)
     tracking = next((n for n, (_, r) in enumerate(kept.results, 1) if r.track and r.track.pose is not None), None)
     rows = rows_of(kept)

@@ -3,6 +3,7 @@ import json
 
 import numpy as np
 import pytest
+from small import INFO, MEAN, constant_model
 
 import shortfinal as sf
 from shortfinal.crops import box_around
@@ -75,12 +76,19 @@ def test_a_corner_beyond_the_frame_is_not_measured(pipeline):
 
 def test_without_a_box_it_looks_where_the_last_accepted_frame_was(frame):
     fresh = sf.LandingPipeline(sf.KeypointDetector(), RUNWAY, CAMERA)
-    lost = fresh.step(frame)
+    fresh.step(frame, box=BOX)
+    again = fresh.step(frame)
+    assert again.verdict.decision is Decision.USE
+    assert "search_ms" not in again.timings
+
+
+def test_a_model_that_cannot_search_says_what_is_missing(frame, tmp_path):
+    info = dataclasses.replace(INFO, size=224)
+    model = constant_model(tmp_path / "model.onnx", info, mean=7 * MEAN)
+    lost = sf.LandingPipeline(sf.KeypointDetector(model), RUNWAY, CAMERA).step(frame)
     assert lost.verdict.decision is Decision.NOT_MONITORED
     assert "where to look is not known" in lost.verdict.reasons[0]
     assert lost.estimate is None
-    fresh.step(frame, box=BOX)
-    assert fresh.step(frame).verdict.decision is Decision.USE
 
 
 def test_the_same_picture_while_time_goes_on_is_a_frozen_camera(frame):

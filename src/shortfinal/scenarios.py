@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from shortfinal.crops import box_around
 from shortfinal.demo import RUNWAY, demo_scene
-from shortfinal.detector import KeypointDetector, Look, shipped_model
+from shortfinal.detector import KeypointDetector, Look, Spot, shipped_model
 from shortfinal.files import sha256_of
 from shortfinal.geometry import Camera, PixelWindow, Pose, project
 from shortfinal.integrity import Decision
@@ -271,7 +271,6 @@ def fly_with(fault: Fault | None, approach: Approach, folder: Path) -> Outcome:
     keeper = _Keeper(approach)
     sinks: list[Sink] = [keeper, _log(folder, pipeline)]
     trouble = _trouble(fault, folder, pipeline, sinks)
-    gnss = np.random.default_rng(7)
 
     def before(n: int) -> None:
         """What happens before a frame is looked at."""
@@ -280,12 +279,9 @@ def fly_with(fault: Fault | None, approach: Approach, folder: Path) -> Outcome:
             trouble.begin()
         if n == _frame_at(END_S):
             trouble.end()
-        if 0 < n < FRAMES and pipeline.tracker is not None and pipeline.tracker.predict(-math.inf) is None:
-            # Stands in for finding the runway unaided, after a track was lost: a position as of GNSS and INS.
-            pipeline._last = approach.poses[n].plus(gnss.normal(0, [8, 4, 4, 0.003, 0.003, 0.003]))
 
     source = _Replay(approach, fault)
-    flown = fly(source, pipeline, sinks, box=approach.box.tolist(), progress=lambda number, _: before(number + 1))
+    flown = fly(source, pipeline, sinks, progress=lambda number, _: before(number + 1))
     begin, end = (0.0, math.inf) if fault in WHOLE_FLIGHT else (BEGIN_S, END_S)
     if fault is Fault.TIME_BACK:  # from one frame to the next; the clock then runs on
         end = begin + 1.0 / RATE_HZ
@@ -381,8 +377,11 @@ class _Locked:
 
     def __init__(self, detector: KeypointDetector, approach: Approach) -> None:
         self._detector, self._approach = detector, approach
-        self.info, self.calibration = detector.info, detector.calibration
+        self.info, self.calibration, self.searches = detector.info, detector.calibration, detector.searches
         self.frame, self.sha256 = 0, detector.sha256
+
+    def spots(self, image: Image, windows: Sequence[PixelWindow]) -> list[Spot]:
+        return self._detector.spots(image, windows)
 
     def look(self, image: Image, window: PixelWindow) -> Look:
         return self.look_all(image, [window])[0]

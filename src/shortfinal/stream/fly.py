@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
 from collections import deque
@@ -20,6 +21,7 @@ from shortfinal.geometry import Pose, project
 from shortfinal.keypoints import GaussianKeypoints
 from shortfinal.pipeline import ENDS, FrameResult, LandingPipeline
 from shortfinal.protection import AlertLimits
+from shortfinal.search import Search
 from shortfinal.stream.frames import FrameSource, Mailbox, TimedFrame
 from shortfinal.stream.sink import Image, Lasting, Log, Prompt, Sink
 from shortfinal.tracker import Tracker
@@ -127,6 +129,9 @@ class Writer:
                 self._close(sink)
 
     def _work(self) -> None:
+        if hasattr(os, "setpriority"):  # where a thread has a priority of its own: pictures must not hold up frames
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._ended)
@@ -208,18 +213,14 @@ def fly(
 ) -> Flown:
     """Every frame of a source through the pipeline, its results to the sinks.
 
-        `box`: where the runway is in the first frame, if known. `newest`: of a source that does not wait, only the
-        newest frame is taken (default: if it is live), and the flight does not wait for the sinks: pictures that they
-        are too slow for are dropped, results are not. A sink that fails is left out and noted. Without a frame for
-        `watchdog_s` a live flight gets a result that says so, and its track coasts. A frame that cannot be processed is
-    <<<<<<< HEAD
-        a verdict of NOT_MONITORED, but for the first one, of another size than the camera's, which is refused. Before it
-        all code is run once. Raises what the source raises, when all results are written.
-    =======
-        a verdict of NOT_MONITORED. Before the first frame all code is run once.
+    `box`: where the runway is in the first frame, if known. `newest`: of a source that does not wait, only the
+    newest frame is taken (default: if it is live), and the flight does not wait for the sinks: pictures that they
+    are too slow for are dropped, results are not. A sink that fails is left out and noted. Without a frame for
+    `watchdog_s` a live flight gets a result that says so, and its track coasts. A frame that cannot be processed is
+    a verdict of NOT_MONITORED. Before the first frame all code is run once.
 
-        Raises what the source raises, when all results are written; InputError if the first frame is not of the camera's
-        size.
+    Raises what the source raises, when all results are written; InputError if the first frame is not of the
+    camera's size.
     """
     latest = source.live if newest is None else newest
     warm_up_s = warm_up(pipeline)
@@ -297,7 +298,9 @@ def warm_up(pipeline: LandingPipeline) -> float:
     middle = np.concatenate([0.4 * size, 0.6 * size])
     for box in (None, middle):
         other.step(noise, 1.0, box=box)
-    with suppress(InputError):  # a network that makes nothing of noise
+    with suppress(InputError):  # a network that cannot search, or makes nothing of noise
+        Search(camera.width, camera.height, detector.info.size).look(detector, noise)
+    with suppress(InputError):
         detector.look_all(noise, [centre_crop(middle, detector.info.margin, detector.info.size)] * len(ENDS))
     return time.perf_counter() - start
 

@@ -168,7 +168,9 @@ def reduced_jpeg(image: Image) -> tuple[bytes, float]:
     """A copy of a frame (h, w, 3; RGB) as JPEG, and its pixels over the frame's."""
     scale = min(1.0, _PICTURE_PX / max(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
-    return cv2.imencode(".jpg", small[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes(), scale
+    return cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, 80))[
+        1
+    ].tobytes(), scale
 
 
 class _Partial:
@@ -244,7 +246,7 @@ class VideoWriter(_Partial):
                 str(self.partial), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), self._fps, size
             ):
                 raise JobError(f"{self.path}: this build of OpenCV cannot write MPEG-4 video there")
-        self._writer.write(np.ascontiguousarray(picture[..., ::-1]))
+        self._writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         self._written += 1
 
     def close(self) -> None:
