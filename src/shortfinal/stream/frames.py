@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -126,6 +127,8 @@ class LiveSource:
             raise InputError(f"{text}: expected the camera's number, e.g. camera:0")
         self._name: int | str = int(name) if text.startswith("camera:") else text
         self._stopped = threading.Event()
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # each attempt in vain would be reported on stderr
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
         self._video = self._open()
         if self._video is None:
             raise InputError(f"{text}: cannot be opened; is it there, and free?")
