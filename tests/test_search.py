@@ -135,18 +135,37 @@ def test_a_runway_is_found_and_then_followed(info):
     assert finder.windows == asked  # not searched any more
 
 
-def test_two_runways_side_by_side_are_ambiguous_without_a_name(info):
+def sighted(info, runways, ident):
+    """The results of one whole search for a runway of that name."""
+    pipeline = sf.LandingPipeline(Finder(info, runways), dataclasses.replace(RUNWAY, ident=ident), CAMERA)
+    return [pipeline.step(FRAME) for _ in range(pipeline._search.frames)]
+
+
+def used(results):
+    return [r.estimate.pose.position_m[1] for r in results if r.verdict.decision is Decision.USE]
+
+
+# Seen to the left, a runway is to the left: the camera is to its right, at a negative y.
+@pytest.mark.parametrize(
+    ("ident", "crosses", "wanted"),
+    [
+        ("XXXX/09", (-120, 120), None), ("XXXX/09L", (-120, 120), 120), ("XXXX/09R", (-120, 120), -120),
+        ("XXXX/09C", (-120, 120), None), ("XXXX/09L", (0,), None), ("XXXX/09R", (0,), None),
+        ("XXXX/09C", (-150, 20, 150), 20), ("XXXX/09", (0,), 0), ("", (0,), 0), ("HELICOPTER", (0,), 0),
+    ],
+)  # fmt: skip
+def test_of_runways_side_by_side_the_named_one_is_used_or_none(info, ident, crosses, wanted):
+    results = sighted(info, [corners_from(cross) for cross in crosses], ident)
+    if wanted is None:
+        assert not used(results)
+        words = "2 runways in view fit" if ident == "XXXX/09" else f"none found that is {ident} for certain"
+        assert any(words in r.verdict.reasons[0] for r in results)
+    else:
+        assert used(results)[0] == pytest.approx(-wanted, abs=1)
+
+
+def test_a_prior_decides_between_two(info):
     pair = [corners_from(-120.0), corners_from(120.0)]
-    for ident, cross in (("XXXX/09", None), ("XXXX/09L", 120.0), ("XXXX/09R", -120.0), ("XXXX/09C", None)):
-        pipeline = sf.LandingPipeline(Finder(info, pair), dataclasses.replace(RUNWAY, ident=ident), CAMERA)
-        results = [pipeline.step(FRAME) for _ in range(pipeline._search.frames)]
-        used = [r for r in results if r.verdict.decision is Decision.USE]
-        if cross is None:
-            assert not used
-            assert any("2 runways in view fit" in r.verdict.reasons[0] for r in results)
-        else:  # seen to the left, the camera is to the runway's right
-            assert used
-            assert abs(used[0].estimate.pose.position_m[1] + cross) < 1
     pipeline = sf.LandingPipeline(Finder(info, pair), RUNWAY, CAMERA)
     prior = sf.Pose.from_attitude([-2500.0, 120.0, 150.0], 0.0, -3.0, 0.0)
     assert pipeline.step(FRAME, prior=prior).verdict.decision is Decision.USE

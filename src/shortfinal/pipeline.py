@@ -229,7 +229,7 @@ class LandingPipeline:
         except InputError as error:
             return FrameResult(timestamp_s, None, None, None, self._not_monitored(str(error)), None, timings)
         results = [self._judged(sight, timestamp_s, timings) for sight in sights]
-        fitting = self._chosen([result for result in results if result.verdict.decision is Decision.USE])
+        fitting = [result for result in self._meant(results) if result.verdict.decision is Decision.USE]
         self._last = None
         if len(fitting) == 1:
             search.again()
@@ -237,21 +237,26 @@ class LandingPipeline:
             self._last = fitting[0].estimate.pose
             return fitting[0]
         reason = f"searching for the runway: {search.progress}, none found"
-        if results:  # a pattern of fields can pass for a runway, but hardly for this one
-            reason += f" that fits; one does not: {'; '.join(results[0].verdict.reasons)}"
-        if fitting:
-            reason = (
-                f"{len(fitting)} runways in view fit, and which is meant is not known: pass a box or a prior pose, or "
-                "call the runway by its name with L, C or R"
+        if results and self._side and not fitting:
+            reason += (
+                f" that is {self.runway.ident} for certain, with {len(results)} in view; a prior pose or a box tells"
             )
+        elif results and not fitting:  # a pattern of fields can pass for a runway, but hardly for this one
+            reason += f" that fits; one does not: {'; '.join(results[0].verdict.reasons)}"
+        elif fitting:
+            reason = f"{len(fitting)} runways in view fit, and which is meant is not known: pass a prior pose or a box"
         return FrameResult(timestamp_s, None, None, None, self._not_monitored(reason), None, timings)
 
     def _settled(self, frame_rgb: Image, spots: list[Spot]) -> list[Sight]:
-        """The runways that are at those spots, and beside them: each settled, nothing in its way."""
+        """The runways that are at those spots, and beside them: each settled, nothing in its way.
+
+        The first for certain; to count those beside it, where the runway's name needs that, less will do.
+        """
         sights: list[Sight] = []
         ahead, followed = list(spots), 0
         while ahead and followed < FOLLOWED:
-            sight, followed = _sight_at(self.detector, frame_rgb, ahead.pop(0)), followed + 1
+            certain = not (sights and self._side)
+            sight, followed = _sight_at(self.detector, frame_rgb, ahead.pop(0), certain), followed + 1
             if sight is None or any(_same(sight, other) for other in sights):
                 continue
             if not sights:
@@ -260,13 +265,23 @@ class LandingPipeline:
             sights.append(sight)
         return sights
 
-    def _chosen(self, fitting: list[FrameResult]) -> list[FrameResult]:
-        """Of several runways side by side the one that the runway's name means: 24L, 24C, 24R; else all."""
+    @property
+    def _side(self) -> str:
+        """L, C or R where the runway's name says that it has others beside it."""
         named = re.search(r"\d([LCR])$", self.runway.ident)
-        if named is None or len(fitting) < 2 or (named[1] == "C" and len(fitting) != 3):
-            return fitting
-        across = sorted(fitting, key=lambda result: 0.0 if result.crop is None else result.crop.left)
-        return [across[{"L": 0, "C": 1, "R": -1}[named[1]]]]
+        return named[1] if named else ""
+
+    def _meant(self, results: list[FrameResult]) -> list[FrameResult]:
+        """Of runways in view those that may be meant: all, or if the name says which side, the one on that side.
+
+        One alone may then be any of them, and so may each of two for a C.
+        """
+        if not self._side:
+            return results
+        if len(results) < (3 if self._side == "C" else 2):
+            return []
+        across = sorted(results, key=lambda result: 0.0 if result.crop is None else result.crop.left)
+        return [across[{"L": 0, "C": len(across) // 2, "R": -1}[self._side]]]
 
     def _judged(self, sight: Sight, timestamp_s: float, timings: dict[str, float]) -> FrameResult:
         seen = (sight.look.present, sight.end_crops, *self._bounds(sight))
@@ -387,8 +402,8 @@ def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float 
     return Sight(look, keypoints, _cut_off(keypoints, frame.shape[1], frame.shape[0]), end_crops)
 
 
-def _sight_at(detector: KeypointDetector, frame: Image, spot: Spot) -> Sight | None:
-    """What is seen at a spot of a search; None unless it is a runway for certain.
+def _sight_at(detector: KeypointDetector, frame: Image, spot: Spot, certain: bool = True) -> Sight | None:
+    """What is seen at a spot of a search; None unless it is a runway, `certain` or likely.
 
     The network names four corners of a field, too, but it is not sure where they are: by its own sigma, less than
     by what it makes of the picture as a whole, what is a runway is told from what is not.
@@ -398,8 +413,10 @@ def _sight_at(detector: KeypointDetector, frame: Image, spot: Spot) -> Sight | N
     except InputError:  # a place of no use
         return None
     _, length = _place(sight)
-    vague = float(sight.keypoints.sigma_px[:4].max()) > SHARP * length
-    doubtful = sight.look.present < SURE or sight.look.visible[:4].min() < SURE_OF_CORNER
+    vague = float(sight.keypoints.sigma_px[:4].max()) > (SHARP if certain else 2 * SHARP) * length
+    doubtful = sight.look.present < (SURE if certain else SURE_OF_CORNER) or (
+        sight.look.visible[:4].min() < (SURE_OF_CORNER if certain else PRESENT)
+    )
     return None if sight.obstacle or vague or doubtful else sight
 
 
