@@ -11,8 +11,8 @@ demo: .venv/base            ## the main job on an embedded approach; writes resu
 test: .venv/dev             ## all tests
 	$(BIN)/pytest
 
-test-fast: .venv/dev        ## without those marked slow
-	$(BIN)/pytest -m "not slow"
+test-fast: .venv/dev        ## without those marked slow, two files at a time
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m "not slow" -n 2 --dist loadfile
 
 check: .venv/dev            ## formatting, lint, types
 	$(BIN)/ruff format --check .

@@ -159,6 +159,7 @@ def test_export_describes_itself(folder, tmp_path):
         assert trace.encode() not in content
 
 
+@pytest.mark.slow
 def test_half_the_digits_in_the_backbone_only(folder, tmp_path):
     info = export(folder / "best.pt", tmp_path / "model.onnx", "fp16")
     assert sf.KeypointDetector(tmp_path / "model.onnx").info == info

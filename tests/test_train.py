@@ -165,7 +165,7 @@ def test_every_pass_shows_every_picture_once_whoever_draws(recipe, scenes):
     shares = [fit._Draws(examples, recipe, range(4, 9), rank, 2) for rank in (0, 1)]
     for place in range(4):
         one, other = alone[4 * 4 + place], shares[place // 2][place % 2]
-        assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+        assert all(torch.equal(a.nan_to_num(-1), b.nan_to_num(-1)) for a, b in zip(one, other, strict=True))
 
 
 def marked(corners, size=(160, 120)):
@@ -578,6 +578,7 @@ def test_a_broken_picture_is_one_line_whoever_reads_it(recipe, tmp_path, workers
     assert str(refusal.value).startswith(str(tmp_path))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not FOLDED.is_file(), reason="shared/data is not here: no pretrained MobileNetV2")
 def test_a_run_begins_from_pretrained_weights_settled_on_its_pictures(recipe, tmp_path):
     pretrained = changed(recipe, tmp_path, backbone="mobilenetv2_100", weights=str(FOLDED), steps=1, batch=2,
