@@ -33,7 +33,7 @@ import shortfinal as sf
 from shortfinal.demo import RUNWAY, demo_scene
 from shortfinal.integrity import Decision
 from shortfinal.pipeline import FrameResult
-from shortfinal.scene.render import render
+from shortfinal.scene.render import render, seen_from
 from shortfinal.stream.fly import BUDGET_MS, Flown, flight_record, fly
 from shortfinal.stream.frames import TimedFrame, VideoSource
 from shortfinal.stream.sink import Log, Sink
@@ -73,18 +73,6 @@ def keys() -> list[int]:
     return chosen
 
 
-def ground_homography(seen: sf.Pose, wanted: sf.Pose) -> Array:
-    """The map (3, 3) from pixels seen at one pose to those at another, exact for the ground z = 0."""
-    matrix = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
-
-    def of(pose: sf.Pose) -> Array:
-        camera_from_runway = pose.runway_from_camera.T
-        ground = np.column_stack([camera_from_runway[:, :2], -camera_from_runway @ pose.position_m])
-        return np.asarray(matrix @ ground)
-
-    return np.asarray(of(wanted) @ np.linalg.inv(of(seen)))
-
-
 def make(folder: Path) -> Path:
     """The video of the approach, made if it is not there."""
     video = folder / "approach.avi"
@@ -113,10 +101,7 @@ def make(folder: Path) -> Path:
             key, picture = nearest, cv2.imread(str(folder / f"{nearest:05d}.png"))
         moved = picture
         if frame != key:
-            moved = cv2.warpPerspective(
-                picture, ground_homography(pose_at(key), pose_at(frame)), (CAMERA.width, CAMERA.height),
-                flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE,
-            )  # fmt: skip
+            moved = seen_from(picture, CAMERA, pose_at(key), CAMERA, pose_at(frame))
         rng = np.random.default_rng(frame)  # another of the fields, elsewhere, turned round
         field_ = np.roll(noise[rng.integers(8)], tuple(rng.integers(0, 500, 2)), axis=(0, 1))[:: rng.choice([-1, 1])]
         writer.write(cv2.add(moved, field_, dtype=cv2.CV_8U))

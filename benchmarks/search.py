@@ -35,7 +35,7 @@ from shortfinal.scene.render import random_scene, render
 from shortfinal.scene.sensor import random_sensor
 from shortfinal.stream.source import read_camera
 
-FRAMES, SEED = 3, 32
+FRAMES, SEED = 3, 33
 CAMERA = Path(__file__).parents[1] / "examples" / "lard640.toml"
 NEAR_M = 2 * NAUTICAL_MILE_M
 

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from shortfinal.detector import KeypointDetector
 from shortfinal.files import make_folder, write_png, write_whole
-from shortfinal.geometry import Camera, Pose, project
+from shortfinal.geometry import Camera, PixelWindow, Pose, project
 from shortfinal.integrity import Decision
 from shortfinal.keypoints import GaussianKeypoints
 from shortfinal.pipeline import FrameResult, LandingPipeline
 from shortfinal.pose import PoseEstimate
 from shortfinal.runway import Runway
-from shortfinal.scene.render import Scene, random_scene, render
-from shortfinal.scene.sensor import Sensor
+from shortfinal.scene.render import Scene, random_scene, render, seen_from
+from shortfinal.scene.sensor import Sensor, expose
 from shortfinal.stream.overlay import Notes, contact_sheet, draw_result
 from shortfinal.stream.sink import JsonlWriter, VideoWriter
 
@@ -37,6 +37,7 @@ GLIDE_DEG, AIM_M = 3.0, 305.0
 SHORT_M = 184.0  # by how much the paper misplaces the far threshold
 _TAXIWAY_EDGE_M = (-1.0, -52.0, 0.0)  # where the scene's taxiway meets the threshold's line
 _SEED = 54
+_BLOCK, _BORDER = 2, 24  # frames a drawn picture serves; pixels around the frame, for the one before it
 
 
 class Fault(Enum):
@@ -107,6 +108,21 @@ def render_frame(scene: Scene, frame: int) -> Image:
     return render(scene, CAMERA, approach_pose(frame), Sensor(0.5, 2.0, 92), samples=3, seed=frame)
 
 
+def _render_ahead(scene: Scene, first: int) -> list[Image]:
+    """The pictures of a block of frames: the last drawn, the one before, far out, the same picture seen from there."""
+    last = min(first + _BLOCK, FRAMES) - 1
+    wide = CAMERA.view(PixelWindow(-_BORDER, -_BORDER, *[n + 2 * _BORDER for n in (CAMERA.width, CAMERA.height)] * 2))
+    drawn = render(scene, wide, approach_pose(last), samples=3)
+    sensor = Sensor(0.5, 2.0, 92)
+    return [
+        expose(
+            seen_from(drawn, wide, approach_pose(last), CAMERA, approach_pose(n)).astype(np.float32),
+            sensor, np.random.default_rng(n),
+        )
+        for n in range(first, last + 1)
+    ]  # fmt: skip
+
+
 def inject(fault: Fault, truth: Pose) -> Callable[[GaussianKeypoints], GaussianKeypoints]:
     """What the fault does to the keypoints: the means move to where the wrong thing is seen."""
     if fault is Fault.NONE:
@@ -130,7 +146,7 @@ def _with_fault(pipeline: LandingPipeline, sound: FrameResult, fault: Fault, tru
 
 
 def fly(detector: KeypointDetector) -> Iterator[tuple[Flown, Image]]:
-    """The approach, frame after frame, with the picture; rendering runs ahead in other threads.
+    """The approach, frame after frame, with the picture; rendering runs ahead in other threads, every second frame.
 
     The crop comes from a prior pose as GNSS and INS would give it: the true one, off by some metres
     and tenths of a degree.
@@ -138,11 +154,15 @@ def fly(detector: KeypointDetector) -> Iterator[tuple[Flown, Image]]:
     scene, rng = demo_scene(), np.random.default_rng(5)
     pipeline = LandingPipeline(detector, RUNWAY, CAMERA)
     with ThreadPoolExecutor() as pool:
-        ahead: list[Future[Image]] = [pool.submit(render_frame, scene, n) for n in range(FRAMES)]
-        for number, future in enumerate(ahead):
+        ahead: list[Future[list[Image]]] = [
+            pool.submit(_render_ahead, scene, first) for first in range(0, FRAMES, _BLOCK)
+        ]
+        for number in range(FRAMES):
             truth, fault = approach_pose(number), fault_at(number)
-            image = future.result()
-            ahead[number] = Future()  # let go of the picture
+            block = ahead[number // _BLOCK].result()
+            image = block[number % _BLOCK]
+            if number % _BLOCK == len(block) - 1:
+                ahead[number // _BLOCK] = Future()  # let go of the pictures
             prior = truth.plus(rng.normal(0, [8, 4, 4, 0.003, 0.003, 0.003]))
             timestamp = number / (FRAMES - 1) * (START_M - END_M) / SPEED_M_S
             sound = pipeline.step(image, timestamp, prior=prior)

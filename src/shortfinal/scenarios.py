@@ -36,7 +36,7 @@ from shortfinal.integrity import Decision
 from shortfinal.keypoints import GaussianKeypoints
 from shortfinal.pipeline import FrameResult, LandingPipeline
 from shortfinal.runway import Runway
-from shortfinal.scene.render import render
+from shortfinal.scene.render import render, seen_from
 from shortfinal.scene.sensor import Sensor, expose
 from shortfinal.stream.fly import BUDGET_MS, flight_record, fly
 from shortfinal.stream.frames import LiveSource, TimedFrame
@@ -140,22 +140,11 @@ def render_approach() -> Approach:
     for first in range(0, FRAMES, _BLOCK):
         # From the nearest pose of the block: the frames before it only shrink it, and stay sharp.
         last = min(first + _BLOCK, FRAMES) - 1
-        drawn = render(scene, wide, poses[last], Sensor(blur_px=0.4), samples=2).astype(np.float32)
-        to_drawn = _from_ground(wide, poses[last])
+        drawn = render(scene, wide, poses[last], Sensor(blur_px=0.4), samples=2)
         for n in range(first, last + 1):
-            moved = to_drawn @ np.linalg.inv(_from_ground(CAMERA, poses[n]))
-            size = (CAMERA.width, CAMERA.height)
-            light = cv2.warpPerspective(drawn, moved, size, flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP)
-            noisy = expose(np.asarray(light, np.float32), Sensor(noise=2.0, jpeg_quality=92), np.random.default_rng(n))
-            images.append(noisy)
+            light = seen_from(drawn, wide, poses[last], CAMERA, poses[n]).astype(np.float32)
+            images.append(expose(light, Sensor(noise=2.0, jpeg_quality=92), np.random.default_rng(n)))
     return Approach(times, poses, images)
-
-
-def _from_ground(camera: Camera, pose: Pose) -> Array:
-    """The homography (3, 3) from the runway's plane (x, y, 1), metres, to pixels."""
-    intrinsic = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
-    ground: Array = np.column_stack([np.eye(3)[:, :2], -pose.position_m])
-    return np.asarray(intrinsic @ pose.runway_from_camera.T @ ground)
 
 
 @dataclass(frozen=True, eq=False)
