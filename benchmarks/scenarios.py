@@ -47,7 +47,7 @@ def row(outcome: Outcome) -> dict[str, Any]:
         "largest_error_m": None if error is None else [round(float(e), 1) for e in error],
         "over_level": None if outcome.worst is None else round(outcome.worst, 3),
         "again_after_s": None if again is None or not math.isfinite(outcome.end_s) else round(again, 2),
-        "notes": list(outcome.notes),
+        "notes": [re.sub(r"\S*/tmp\w+", "results", note) for note in outcome.notes],
         "facts": {k: v for k, v in outcome.facts.items() if k != "poses_s"},
     }
 

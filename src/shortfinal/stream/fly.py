@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import threading
 import time
 from collections import deque
@@ -129,7 +130,7 @@ class Writer:
                 self._close(sink)
 
     def _work(self) -> None:
-        if hasattr(os, "setpriority"):  # where a thread has a priority of its own: pictures must not hold up frames
+        if sys.platform == "linux":  # there a thread has a priority of its own: pictures must not hold up frames
             with suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
         while True:
