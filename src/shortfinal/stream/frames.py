@@ -77,7 +77,7 @@ class FolderSource:
 
     def __init__(self, folder: Path, fps: float) -> None:
         self.paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-        self.fps = fps
+        self.fps, self.count = fps, len(self.paths)
         if not self.paths:
             raise InputError(f"{folder}: no image in it; expected {', '.join(IMAGE_SUFFIXES)}")
 
@@ -99,6 +99,8 @@ class VideoSource:
         told = float(self._video.get(cv2.CAP_PROP_FPS))
         self._own_times = fps is None and 0 < told <= 1000
         self.fps = fps or (told if self._own_times else FPS)
+        frames = int(self._video.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.count = frames if frames > 0 else None  # as the file says
 
     def __iter__(self) -> Iterator[TimedFrame]:
         number, before = 0, -1.0
