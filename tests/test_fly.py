@@ -5,6 +5,7 @@ import json
 import math
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -628,6 +629,20 @@ def test_available_is_what_may_be_used_with_every_level_within_its_limit(tmp_pat
         log.close()
         lines = [json.loads(line) for line in (tmp_path / "frames.jsonl").read_text().splitlines()]
         assert [line["available"] for line in lines] == expected
+
+
+def test_a_flight_is_not_written_over_itself(folder, tmp_path, capsys):
+    flight = tmp_path / "flight.mp4"
+    flight.write_bytes(b"all there is")
+    there = tmp_path / "out" / "frames"
+    shutil.copytree(folder, there)
+    before = sorted(path.name for path in there.iterdir())
+    common = arguments(folder, tmp_path)[2:]
+    for option in ("--video", "--mcap", "--rerun"):
+        assert "the flight itself" in refused(capsys, "run", flight, *common, option, tmp_path / "." / "flight.mp4")
+    assert "would be deleted" in refused(capsys, "run", there, *common)
+    assert flight.read_bytes() == b"all there is"
+    assert sorted(path.name for path in there.iterdir()) == before
 
 
 @pytest.mark.parametrize("text", ["40,35", "40,0,35", "a,b,c", "nan,1,1"])

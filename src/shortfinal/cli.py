@@ -170,6 +170,7 @@ def _fly(
         raise InputError(f"{source}: a flight needs its camera: pass --camera (width, height, fx, fy, cx, cy)")
     if runway is None:
         raise InputError(f"{source}: a flight needs its runway: pass --size 2000x45, or --runway LFPO/24 and --runways")
+    wanted.spare(Path(source), out)
     first = _box(box) if box else None
     path = model or shipped_model()
     pipeline = LandingPipeline(
@@ -214,6 +215,15 @@ class _Sinks:
     rerun: Path | None
     view: bool
     copies: int  # of every so many frames, in the folder
+
+    def spare(self, source: Path, out: Path) -> None:
+        """Raises InputError if what is written would take the place of the flight itself."""
+        flight = source.resolve()
+        for name, path in (("--video", self.video), ("--mcap", self.mcap), ("--rerun", self.rerun)):
+            if path is not None and path.resolve() == flight:
+                raise InputError(f"{name} {path}: is the flight itself, which it would replace; choose another name")
+        if (out / "frames").resolve() == flight:
+            raise InputError(f"--out {out}: its frames are the flight itself, and would be deleted; choose another")
 
     def opened(self, pipeline: LandingPipeline, flight: dict[str, Any], fps: float) -> list[Sink]:
         """Those that are wanted; `fps` of the video."""
