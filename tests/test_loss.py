@@ -209,7 +209,7 @@ def fitted(warm_up, seed):
     optimizer = torch.optim.Adam(run.model.parameters(), lr=3e-3)
     x = torch.rand(512, 1) * 2 - 1
     seen = waves(x) + noise(x) * torch.randn(512, 1, 2)
-    batch = Batch(x, seen, torch.ones(512, 1), torch.ones(512))
+    batch = Batch(x, seen, torch.ones(512, 1), torch.full((512, 4), torch.nan), torch.ones(512))
     for step in range(run.steps):
         run.step = step
         optimizer.zero_grad()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -37,7 +38,9 @@ GLIDE_DEG, AIM_M = 3.0, 305.0
 SHORT_M = 184.0  # by how much the paper misplaces the far threshold
 _TAXIWAY_EDGE_M = (-1.0, -52.0, 0.0)  # where the scene's taxiway meets the threshold's line
 _SEED = 54
-_BLOCK, _BORDER = 2, 24  # frames a drawn picture serves; pixels around the frame, for the one before it
+# A drawn picture also serves the frames before it that are at most so much farther from the aiming point; pixels
+# around the frame, for these.
+_FARTHER, _BORDER = 0.06, 64
 
 
 class Fault(Enum):
@@ -108,9 +111,20 @@ def render_frame(scene: Scene, frame: int) -> Image:
     return render(scene, CAMERA, approach_pose(frame), Sensor(0.5, 2.0, 92), samples=3, seed=frame)
 
 
-def _render_ahead(scene: Scene, first: int) -> list[Image]:
-    """The pictures of a block of frames: the last drawn, the one before, far out, the same picture seen from there."""
-    last = min(first + _BLOCK, FRAMES) - 1
+def _blocks() -> list[range]:
+    """The frames, those together that one drawn picture serves."""
+    way = [AIM_M - float(approach_pose(n).position_m[0]) for n in range(FRAMES)]
+    first, blocks = 0, list[range]()
+    for n in range(1, FRAMES + 1):
+        if n == FRAMES or way[first] > (1 + _FARTHER) * way[n]:
+            blocks.append(range(first, n))
+            first = n
+    return blocks
+
+
+def _render_ahead(scene: Scene, frames: range) -> list[Image]:
+    """The pictures of a block of frames: the last one drawn, the others what is seen of it from farther out."""
+    last = frames[-1]
     wide = CAMERA.view(PixelWindow(-_BORDER, -_BORDER, *[n + 2 * _BORDER for n in (CAMERA.width, CAMERA.height)] * 2))
     drawn = render(scene, wide, approach_pose(last), samples=3)
     sensor = Sensor(0.5, 2.0, 92)
@@ -119,7 +133,7 @@ def _render_ahead(scene: Scene, first: int) -> list[Image]:
             seen_from(drawn, wide, approach_pose(last), CAMERA, approach_pose(n)).astype(np.float32),
             sensor, np.random.default_rng(n),
         )
-        for n in range(first, last + 1)
+        for n in frames
     ]  # fmt: skip
 
 
@@ -146,7 +160,7 @@ def _with_fault(pipeline: LandingPipeline, sound: FrameResult, fault: Fault, tru
 
 
 def fly(detector: KeypointDetector) -> Iterator[tuple[Flown, Image]]:
-    """The approach, frame after frame, with the picture; rendering runs ahead in other threads, every second frame.
+    """The approach, frame after frame, with the picture; rendering runs ahead in other threads.
 
     The crop comes from a prior pose as GNSS and INS would give it: the true one, off by some metres
     and tenths of a degree.
@@ -154,20 +168,21 @@ def fly(detector: KeypointDetector) -> Iterator[tuple[Flown, Image]]:
     scene, rng = demo_scene(), np.random.default_rng(5)
     pipeline = LandingPipeline(detector, RUNWAY, CAMERA)
     with ThreadPoolExecutor() as pool:
-        ahead: list[Future[list[Image]]] = [
-            pool.submit(_render_ahead, scene, first) for first in range(0, FRAMES, _BLOCK)
-        ]
-        for number in range(FRAMES):
+        ahead = deque((frames, pool.submit(_render_ahead, scene, frames)) for frames in _blocks())
+        for number, image in _in_turn(ahead):
             truth, fault = approach_pose(number), fault_at(number)
-            block = ahead[number // _BLOCK].result()
-            image = block[number % _BLOCK]
-            if number % _BLOCK == len(block) - 1:
-                ahead[number // _BLOCK] = Future()  # let go of the pictures
             prior = truth.plus(rng.normal(0, [8, 4, 4, 0.003, 0.003, 0.003]))
             timestamp = number / (FRAMES - 1) * (START_M - END_M) / SPEED_M_S
             sound = pipeline.step(image, timestamp, prior=prior)
             result = _with_fault(pipeline, sound, fault, truth)
             yield Flown(number, fault, truth, result, sound.estimate), image
+
+
+def _in_turn(ahead: deque[tuple[range, Future[list[Image]]]]) -> Iterator[tuple[int, Image]]:
+    """Frame by frame, letting go of each block's pictures after it."""
+    while ahead:
+        frames, future = ahead.popleft()
+        yield from zip(frames, future.result(), strict=True)
 
 
 def run_demo(
