@@ -39,8 +39,8 @@ SHORT_M = 184.0  # by how much the paper misplaces the far threshold
 _TAXIWAY_EDGE_M = (-1.0, -52.0, 0.0)  # where the scene's taxiway meets the threshold's line
 _SEED = 54
 # A drawn picture also serves the frames before it that are at most so much farther from the aiming point; pixels
-# around the frame, for these.
-_FARTHER, _BORDER = 0.06, 64
+# beside the frame and below it, for these: from farther out more of the ground before the camera is seen.
+_FARTHER, _BESIDE, _BELOW = 0.06, 204, 188
 
 
 class Fault(Enum):
@@ -125,7 +125,8 @@ def _blocks() -> list[range]:
 def _render_ahead(scene: Scene, frames: range) -> list[Image]:
     """The pictures of a block of frames: the last one drawn, the others what is seen of it from farther out."""
     last = frames[-1]
-    wide = CAMERA.view(PixelWindow(-_BORDER, -_BORDER, *[n + 2 * _BORDER for n in (CAMERA.width, CAMERA.height)] * 2))
+    width, height = CAMERA.width + 2 * _BESIDE, CAMERA.height + _BELOW
+    wide = CAMERA.view(PixelWindow(-_BESIDE, 0, width, height, width, height))
     drawn = render(scene, wide, approach_pose(last), samples=3)
     sensor = Sensor(0.5, 2.0, 92)
     return [
