@@ -110,7 +110,7 @@ def random_margin(box: ArrayLike, image_size: tuple[int, int], rng: np.random.Ge
 
 
 def search_crop(box: Array | None, image_size: tuple[int, int], size: int, rng: np.random.Generator) -> PixelWindow:
-    """A window as the search lays them over a frame (`search.windows_of`), for training.
+    """A window as the search lays them over a frame (`search.search_windows`), for training.
 
     A runway's box (4,) is 0.03 to 0.75 of its side (log-uniform), as far as the image (width, height) and twice its
     resolution allow; three in four hold the box's centre. Without a box: of any scale, anywhere.

@@ -133,6 +133,10 @@ class Spot(NamedTuple):
         half, centre = self.side_px / 2, np.array(self.centre_px)
         return np.concatenate([centre - half, centre + half])
 
+    def overlaps(self, other: Spot) -> bool:
+        """Whether both are of one place: their centres within half the larger box of one another."""
+        return math.dist(self.centre_px, other.centre_px) < max(self.side_px, other.side_px) / 2
+
 
 class KeypointDetector:
     """A model file, loaded. `look` turns an image and a window of it into keypoints in the image's pixels."""

@@ -30,9 +30,9 @@ T = TypeVar("T")
 
 WIDE_MARGIN = 1.9  # of the first crop around a prior pose: the widest that training uses
 SPOT_MARGIN = 2.2  # of the first crop where a search found something: its place and size are rough
-# What a search finds is a runway if its presence is as probable as SURE, each corner as SURE_OF_CORNER, and no
-# coordinate's sigma exceeds the share SHARP of the longer side of its box (benchmarks/search.py, docs/search.md).
-SURE, SURE_OF_CORNER, SHARP = 0.999, 0.9, 0.09
+# What a search finds is a runway if it is present and each corner is visible with such a probability, and no
+# coordinate's sigma exceeds such a share of the longer side of its box (benchmarks/search.py, docs/search.md).
+CERTAIN, LIKELY = (0.999, 0.9, 0.09), (0.9, 0.5, 0.18)
 FOLLOWED = 6  # spots of a frame, at most, that are looked at closely
 LOOKS = 3  # crops at most, for a frame
 PRESENT = 0.5  # probability of a runway below which there is none, and of a corner below which it is not seen
@@ -255,12 +255,12 @@ class LandingPipeline:
         sights: list[Sight] = []
         ahead, followed = list(spots), 0
         while ahead and followed < FOLLOWED:
-            certain = not (sights and self._side)
-            sight, followed = _sight_at(self.detector, frame_rgb, ahead.pop(0), certain), followed + 1
-            if sight is None or any(_same(sight, other) for other in sights):
+            limits = LIKELY if sights and self._side else CERTAIN
+            sight, followed = _sight_at(self.detector, frame_rgb, ahead.pop(0), limits), followed + 1
+            if sight is None or any(_spot_of(sight).overlaps(_spot_of(other)) for other in sights):
                 continue
             if not sights:
-                around = windows_around(Spot(1.0, *_place(sight)), self.detector.info.size)
+                around = windows_around(_spot_of(sight), self.detector.info.size)
                 ahead = distinct([*ahead, *self.detector.spots(frame_rgb, around)])
             sights.append(sight)
         return sights
@@ -402,8 +402,8 @@ def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float 
     return Sight(look, keypoints, _cut_off(keypoints, frame.shape[1], frame.shape[0]), end_crops)
 
 
-def _sight_at(detector: KeypointDetector, frame: Image, spot: Spot, certain: bool = True) -> Sight | None:
-    """What is seen at a spot of a search; None unless it is a runway, `certain` or likely.
+def _sight_at(detector: KeypointDetector, frame: Image, spot: Spot, limits: tuple[float, float, float]) -> Sight | None:
+    """What is seen at a spot of a search; None unless it is a runway within `limits` (CERTAIN, LIKELY).
 
     The network names four corners of a field, too, but it is not sure where they are: by its own sigma, less than
     by what it makes of the picture as a whole, what is a runway is told from what is not.
@@ -412,24 +412,17 @@ def _sight_at(detector: KeypointDetector, frame: Image, spot: Spot, certain: boo
         sight = see(detector, frame, spot.box, SPOT_MARGIN)
     except InputError:  # a place of no use
         return None
-    _, length = _place(sight)
-    vague = float(sight.keypoints.sigma_px[:4].max()) > (SHARP if certain else 2 * SHARP) * length
-    doubtful = sight.look.present < (SURE if certain else SURE_OF_CORNER) or (
-        sight.look.visible[:4].min() < (SURE_OF_CORNER if certain else PRESENT)
-    )
+    present, visible, share = limits
+    vague = float(sight.keypoints.sigma_px[:4].max()) > share * _spot_of(sight).side_px
+    doubtful = sight.look.present < present or sight.look.visible[:4].min() < visible
     return None if sight.obstacle or vague or doubtful else sight
 
 
-def _place(sight: Sight) -> tuple[tuple[float, float], float]:
-    """Where a runway is, as a `Spot` says it: the centre of its box, px, and the longer side."""
+def _spot_of(sight: Sight) -> Spot:
+    """The place of a runway that was looked at."""
     box = box_around(sight.keypoints.mean_px[:4])
-    return (float(box[0] + box[2]) / 2, float(box[1] + box[3]) / 2), float((box[2:] - box[:2]).max())
-
-
-def _same(one: Sight, other: Sight) -> bool:
-    """Whether two sights are of one runway: the centres of their boxes within half a box of one another."""
-    (centre, length), (place, size) = _place(one), _place(other)
-    return math.dist(centre, place) < max(length, size) / 2
+    u, v = ((box[:2] + box[2:]) / 2).tolist()
+    return Spot(sight.look.present, (u, v), float((box[2:] - box[:2]).max()))
 
 
 def _sharpened(

@@ -78,8 +78,7 @@ def distinct(spots: Sequence[Spot]) -> list[Spot]:
     """Each place once: of those of which one lies within the other's box, the likeliest; likeliest first."""
     kept: list[Spot] = []
     for spot in sorted(spots, reverse=True):
-        near = (max(spot.side_px, other.side_px) / 2 > math.dist(spot.centre_px, other.centre_px) for other in kept)
-        if not any(near):
+        if not any(spot.overlaps(other) for other in kept):
             kept.append(spot)
     return kept
 

@@ -168,9 +168,8 @@ def reduced_jpeg(image: Image) -> tuple[bytes, float]:
     """A copy of a frame (h, w, 3; RGB) as JPEG, and its pixels over the frame's."""
     scale = min(1.0, _PICTURE_PX / max(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
-    return cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, 80))[
-        1
-    ].tobytes(), scale
+    jpeg = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, 80))[1]
+    return jpeg.tobytes(), scale
 
 
 class _Partial:
