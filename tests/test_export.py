@@ -113,7 +113,7 @@ def test_the_file_answers_as_torch_for_any_number_of_pictures(tmp_path, network)
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["fp32", "fp16"])
 def test_where_runways_are_is_told_on_request(tmp_path, precision):
-    path = checkpoint(tmp_path / "best.pt", learn="where", crop="tile", start="another.pt")
+    path = checkpoint(tmp_path / "best.pt", learn="where", start="another.pt")
     export(path, tmp_path / "model.onnx", precision)
     detector = sf.KeypointDetector(tmp_path / "model.onnx")
     assert detector.searches

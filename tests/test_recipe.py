@@ -79,8 +79,8 @@ DAMAGE = [
     ({"keypoints": [*sf.CORNER_NAMES, "near-left"]}, "keypoints: near-left, near-right, far-right, far-left, near-l"),
     ({"likelihood": "beta", "covariance": "full"}, "likelihood: beta weighs coordinates one by one"),
     ({"learn": "covariance"}, "learn: covariance needs start, a checkpoint"),
-    ({"learn": "where", "crop": "tile"}, "learn: where needs start, a checkpoint"),
-    ({"crop": "tile"}, 'learn: where needs crop = "tile", and only it'),
+    ({"learn": "where"}, "learn: where needs start, a checkpoint"),
+    ({"crop": "tile"}, "crop: 'tile'; expected one of framed, native"),
 ]
 
 

@@ -486,7 +486,6 @@ def test_learning_to_search_leaves_the_rest_as_it_is(recipe, scenes, done, tmp_p
     changes = {
         "start": start,
         "learn": "where",
-        "crop": "tile",
         "covariance": "keypoint",
         "steps": 3,
         "validate_every": 1,

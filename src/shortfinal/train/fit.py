@@ -72,7 +72,7 @@ class _Draws(Dataset[Batch]):
         number = self.steps[step] * recipe.batch + self.rank * self.share + place
         rng = np.random.default_rng([recipe.seed, 1, number])
         example = self.examples[self._pick(number)]
-        crop, corners = augmented_crop(example, recipe.size, rng, kind=recipe.crop, weather=recipe.weather)
+        crop, corners = augmented_crop(example, recipe.size, rng, kind=recipe.cut, weather=recipe.weather)
         return _labelled(crop, corners, 1.0, recipe)
 
     def _pick(self, number: int) -> int:
@@ -106,12 +106,12 @@ def held_out_window(example: Example, recipe: Recipe, index: int) -> PixelWindow
     height, width = example.image.shape[:2]
     corners = within(example)[:4]
     seen = corners[np.isfinite(corners).all(axis=1)]
-    if recipe.crop == "tile":
+    if recipe.cut == "tile":
         rng = np.random.default_rng([recipe.seed, 2, index])
         return search_crop(box_around(seen) if len(seen) == 4 else None, (width, height), recipe.size, rng)
     if len(seen) < 2:
         return PixelWindow.resize(width, height, recipe.size, recipe.size)
-    if recipe.crop == "native" and len(seen) == 4:
+    if recipe.cut == "native" and len(seen) == 4:
         rng = np.random.default_rng([recipe.seed, 2, index])
         return native_crop(box_around(seen), (width, height), rng, recipe.size, 0.0)
     return centre_crop(box_around(seen), recipe.margin, recipe.size)

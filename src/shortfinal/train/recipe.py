@@ -16,6 +16,7 @@ from shortfinal.keypoints import CORNER_NAMES
 from shortfinal.train.loss import Likelihood
 from shortfinal.train.model import Covariance, Head
 
+Framing = Literal["framed", "native"]
 Optimizer = Literal["adamw", "adam", "rmsprop"]
 Schedule = Literal["cosine", "constant"]
 Learn = Literal["all", "covariance", "where"]
@@ -42,8 +43,8 @@ class Recipe:
     std: tuple[float, ...] = (0.25, 0.25, 0.25)
     # pictures
     size: int = 224  # side of the crop, px
-    # Of random scale around the runway, as the pipeline looks; "native": as the paper's; "tile": as it searches.
-    crop: Crop = "framed"
+    # Of random scale around the runway, as the pipeline looks; "native": as the paper's.
+    crop: Framing = "framed"
     margin: float = 1.4  # of the framed crop in evaluation; training draws its own (crops.random_margin)
     weather: bool = True  # augment: another camera in other weather
     # loss
@@ -88,8 +89,11 @@ class Recipe:
             raise InputError(f"likelihood: beta weighs coordinates one by one; covariance {self.covariance} has more")
         if self.learn != "all" and not self.start:
             raise InputError(f"learn: {self.learn} needs start, a checkpoint whose other parts are kept")
-        if (self.learn == "where") != (self.crop == "tile"):
-            raise InputError('learn: where needs crop = "tile", and only it')
+
+    @property
+    def cut(self) -> Crop:
+        """How pictures are cut: as `crop` says, or as the search looks at them, to learn where runways are."""
+        return "tile" if self.learn == "where" else self.crop
 
 
 # The paper's: 30 epochs, 80/20, Adam 5e-4 for ResNets, RMSProp 1e-4 for EfficientNet (arXiv 2508.09732).
@@ -158,7 +162,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "attention_weight": (0.0, 1e3), "scope_weight": (0.0, 1e3),
 }  # fmt: skip
 _CHOICES = {
-    "Head": Head, "Covariance": Covariance, "Crop": Crop, "Likelihood": Likelihood, "Optimizer": Optimizer,
+    "Head": Head, "Covariance": Covariance, "Framing": Framing, "Likelihood": Likelihood, "Optimizer": Optimizer,
     "Schedule": Schedule, "Learn": Learn, "Precision": Precision,
 }  # fmt: skip
 _NUMBERS: dict[str, Any] = {"int": int, "float": (int, float)}
