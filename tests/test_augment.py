@@ -7,6 +7,7 @@ from shortfinal.data.augment import (
     Warp,
     augmented_crop,
     beside_warp,
+    corner_looks,
     inside,
     native_warp,
     night,
@@ -331,3 +332,33 @@ def test_effects_need_no_corners(effect, count):
     crops = [effect.apply(light, MARKED.apply(CORNERS)[:count], rng) for _ in range(10)]
     assert all(crop.shape == light.shape and crop.dtype == np.uint8 for crop in crops)
     assert any((crop != light).any() for crop in crops)
+
+
+def test_corners_are_where_their_patches_show_them():
+    shot, rng, seen, offsets = example(CORNERS, 3.0), np.random.default_rng(20), 0, []
+    for _ in range(60):
+        patches, places, scale = corner_looks(shot, rng, weather=False)
+        assert patches.shape == (4, 48, 48, 3)
+        for patch, place, enlarged in zip(patches, places, scale):
+            if np.isfinite(place).all() and 1 < enlarged * 3.0 < 4 and (np.abs(place - 23.5) < 12).all():
+                v, u = np.indices(patch.shape[:2])
+                near = np.hypot(u - place[0], v - place[1]) < 11  # other corners' dots are farther
+                weight = np.clip(patch[..., 0] - 75.0, 0, None) * near  # of a ground of 60; black beyond it
+                centre = np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
+                np.testing.assert_allclose(centre, place, atol=0.35)
+                seen += 1
+                offsets.append(place - 23.5)
+    assert seen > 40
+    assert np.std(offsets) > 2  # first looks are off
+
+
+def test_a_first_look_may_be_far_off_or_of_nothing():
+    rng = np.random.default_rng(21)
+    missed = sum(
+        (np.abs(corner_looks(example(CORNERS, 3.0), rng, weather=False)[1] - 23.5) > 24).any() for _ in range(300)
+    )
+    assert missed > 0
+    _, places, _ = corner_looks(Example(example(CORNERS, 3.0).image, None), rng)
+    assert np.isnan(places).all()
+    one = Example(example(CORNERS, 3.0).image, np.where(np.eye(4)[:, :1] > 0, CORNERS, np.nan))
+    assert np.isfinite(corner_looks(one, rng)[1]).all(axis=1).sum() <= 1

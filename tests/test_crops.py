@@ -3,7 +3,16 @@ import pytest
 from scipy.stats import binomtest, chi2_contingency, chisquare, ks_2samp, kstest, loguniform, uniform
 
 import shortfinal as sf
-from shortfinal.crops import bogo_crop, box_around, centre_crop, inverse_crop, native_crop, random_margin
+from shortfinal.crops import (
+    PATCH_PX,
+    bogo_crop,
+    box_around,
+    centre_crop,
+    corner_patches,
+    inverse_crop,
+    native_crop,
+    random_margin,
+)
 from shortfinal.detector import crop_image
 
 BOX = np.array([100.0, 50.0, 180.0, 90.0])
@@ -228,3 +237,54 @@ def test_a_box_that_is_none_is_refused(box, margin, message):
 def test_a_native_crop_that_cannot_be_is_refused(box, margin_px, message):
     with pytest.raises(sf.InputError, match=message):
         native_crop(box, (100, 80), np.random.default_rng(0), 224, margin_px)
+
+
+SEEN = np.array([[300.0, 420], [420, 410], [372, 300], [340, 302]])  # corners of a runway, 120 px wide here, 32 there
+
+
+def in_patch(image_from_patch, px):
+    return np.linalg.solve(image_from_patch[:, :2], np.asarray(px) - image_from_patch[:, 2])
+
+
+def test_every_corner_looks_alike_in_its_patch():
+    maps = corner_patches(SEEN, np.full((4, 2), 0.5))
+    centre = (PATCH_PX - 1) / 2
+    for corner, (across, along) in enumerate(zip([1, 0, 3, 2], [3, 2, 1, 0])):
+        here, beside, ahead = (in_patch(maps[corner], SEEN[n]) for n in (corner, across, along))
+        np.testing.assert_allclose(here, centre, atol=1e-9)
+        assert beside[0] > centre + 1  # along x, and nothing else
+        np.testing.assert_allclose(beside[1], centre, atol=1e-9)
+        assert ahead[1] > centre + 1  # along y
+        np.testing.assert_allclose(ahead[0], centre, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("width", "sigma", "half"),
+    [(60.0, 0.5, 24.0), (14.0, 0.5, 14.0), (400.0, 0.5, 100.0), (60.0, 8.0, 40.0), (1.0, 0.1, 2.0)],
+    ids=["at the image's resolution", "a narrow end", "a wide one", "as far as it may be", "hardly a width at all"],
+)
+def test_a_patch_reaches_as_far_as_the_end_is_wide_and_as_the_corner_is_uncertain(width, sigma, half):
+    square = np.array([[0.0, 0], [width, 0], [width, -width], [0, -width]])
+    maps = corner_patches(square, np.full((4, 2), sigma))
+    for corner, outward in enumerate([[-1, 1], [1, 1], [1, -1], [-1, -1]]):
+        border = in_patch(maps[corner], square[corner] + half * np.array(outward))
+        np.testing.assert_allclose(border, -0.5, atol=1e-9)
+
+
+def test_a_patchs_axes_are_never_flat():
+    flat = np.array([[0.0, 0], [100, 1], [180, 2], [90, 3]])  # a runway seen from hardly above it, turned
+    same = np.zeros((4, 2))  # nothing at all: whatever is said of it, the maps can be inverted
+    for corners in (flat, same, flat[::-1]):
+        maps = corner_patches(corners, np.ones((4, 2)))
+        x, y = maps[:, :, 0], maps[:, :, 1]
+        length = np.linalg.norm(x, axis=1)
+        np.testing.assert_allclose(np.linalg.norm(y, axis=1), length)
+        turn = np.abs(x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]) / length**2
+        assert (turn > np.sin(np.radians(24.99))).all()
+
+
+def test_patches_of_nothing_are_refused():
+    with pytest.raises(sf.InputError, match="corners_px"):
+        corner_patches(SEEN[:3], np.ones((4, 2)))
+    with pytest.raises(sf.InputError, match="sigma_px"):
+        corner_patches(SEEN, np.full((4, 2), np.nan))

@@ -4,10 +4,12 @@ import json
 import cv2
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from small import INFO, MEAN, constant_model
 
 import shortfinal as sf
 from shortfinal.calibration import LEVELS, Calibration
+from shortfinal.crops import PATCH_PX, corner_patches
 from shortfinal.detector import METADATA_KEY, ModelInfo, crop_image, described, normalise, shipped_model
 
 pytest.importorskip("onnx")
@@ -96,6 +98,53 @@ def test_several_windows_are_seen_as_one_by_one():
         np.testing.assert_allclose(look.keypoints.sigma_px, alone.sigma_px, rtol=1e-4)
     assert np.ptp([look.keypoints.mean_px[0, 0] for look in looks]) > 1  # they do differ
     assert detector.look_all(PICTURE, []) == []
+
+
+KNOWN = sf.GaussianKeypoints.from_sigma([[40.0, 80], [120, 78], [95, 30], [60, 31]], 0.5)
+
+
+def test_corners_are_looked_at_each_by_itself(tmp_path):
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(8, 8))
+    cov, offset = root @ root.T + np.eye(8), rng.normal(0, 3, (4, 2))
+    said = ((PATCH_PX - 1) / 2 + offset, cov, np.array([0.9, 0.6, 0.4, 0.99]))
+    detector = sf.KeypointDetector(constant_model(tmp_path / "m.onnx", corners=said))
+    assert detector.sharpens
+    assert not sf.KeypointDetector(constant_model(tmp_path / "n.onnx")).sharpens
+    sharp = detector.sharpened(PICTURE, KNOWN, looks=1)
+    axes = corner_patches(KNOWN.mean_px, KNOWN.sigma_px)[:, :, :2]
+    seen = [0, 1, 3]  # the third is not: it stays as it was
+    np.testing.assert_allclose(
+        sharp.mean_px[seen], (KNOWN.mean_px + (axes @ offset[..., None])[..., 0])[seen], rtol=1e-5
+    )
+    np.testing.assert_array_equal(sharp.mean_px[2], KNOWN.mean_px[2])
+    turn = block_diag(*axes)
+    rows = np.repeat(2 * np.array(seen), 2) + [0, 1] * 3
+    wanted = (turn @ cov @ turn.T)[np.ix_(rows, rows)]
+    np.testing.assert_allclose(sharp.cov_px[np.ix_(rows, rows)], wanted, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(sharp.cov_px[4:6, 4:6], KNOWN.cov_px[4:6, 4:6])
+    assert not sharp.cov_px[np.ix_(rows, [4, 5])].any()
+    again = detector.sharpened(PICTURE, sharp, looks=1)  # from where the first put them
+    np.testing.assert_array_equal(detector.sharpened(PICTURE, KNOWN).mean_px, again.mean_px)
+
+
+def test_calibration_widens_what_a_look_at_a_corner_says_once(tmp_path):
+    scale = np.arange(1.0, 9.0)
+    bounds = tuple((level,) * 8 for level in LEVELS)
+    calibration = Calibration(tuple(scale), LEVELS, bounds, (100,) * 8, "somewhere")
+    said = (np.full((4, 2), (PATCH_PX - 1) / 2), np.eye(8) + 0.3, np.ones(4))
+    path = constant_model(tmp_path / "m.onnx", dataclasses.replace(INFO, calibration=calibration), corners=said)
+    mended = sf.KeypointDetector(path).sharpened(PICTURE, KNOWN, looks=1)
+    own = sf.KeypointDetector(path, calibrated=False).sharpened(PICTURE, KNOWN, looks=1)
+    np.testing.assert_allclose(mended.cov_px, own.cov_px * np.outer(scale, scale), rtol=1e-6)
+
+
+@pytest.mark.parametrize("part", range(3))
+def test_corners_of_another_shape_are_refused(tmp_path, part):
+    said = [np.zeros((4, 2)), np.eye(8), np.ones(4)]
+    said[part] = said[part][:3]
+    with pytest.raises(sf.InputError, match="unlike its description"):
+        sf.KeypointDetector(constant_model(tmp_path / "m.onnx", corners=said))
 
 
 def test_correlations_survive_the_rounding_of_float32(tmp_path):

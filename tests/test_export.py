@@ -11,6 +11,7 @@ from torch.optim.swa_utils import AveragedModel  # noqa: E402
 
 from shortfinal.train import export as module  # noqa: E402
 from shortfinal.train.export import LIMITS, Difference, export, load_network, random_pictures  # noqa: E402
+from shortfinal.train.fit import PARTS  # noqa: E402
 from shortfinal.train.model import KeypointNet  # noqa: E402
 from shortfinal.train.recipe import Recipe, to_dict  # noqa: E402
 
@@ -24,7 +25,7 @@ def checkpoint(path, keypoints=sf.CORNER_NAMES, sharp=300.0, **network):
     torch.manual_seed(0)
     net = KeypointNet(
         recipe.backbone, len(keypoints), recipe.head, recipe.covariance, recipe.features, recipe.width,
-        where=recipe.learn == "where",
+        **{name: recipe.learn == name for name in PARTS},
     )  # fmt: skip
     with torch.no_grad():
         for name, weight in net.named_parameters():
@@ -132,6 +133,40 @@ def test_where_runways_are_is_told_on_request(tmp_path, precision):
         assert unasked.size == 0  # a look at a crop does not pay for it
     spots = detector.spots(np.zeros((SIZE, SIZE, 3), np.uint8), [sf.PixelWindow(0, 0, SIZE, SIZE, SIZE, SIZE)])
     assert spots == sorted(spots, reverse=True)
+
+
+@pytest.mark.slow
+def test_each_corner_is_looked_at_on_request(tmp_path, folder):
+    path = checkpoint(tmp_path / "best.pt", learn="corners", covariance="full", start="another.pt")
+    export(path, tmp_path / "model.onnx")
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(tmp_path / "model.onnx"), providers=["CPUExecutionProvider"])
+    names = ["corner_px", "corner_cov_px", "corner_visible"]
+    network, _ = load_network(path)
+    nothing = np.empty((0, 3, SIZE, SIZE), np.float32)
+    for count in (1, 3):
+        patches = random_pictures(48, 4 * count, seed=count).reshape(count, 4, 3, 48, 48)
+        with torch.inference_mode():
+            wanted = network.net(torch.from_numpy(patches))
+        mean, cov, visible = session.run(names, {"image": nothing, "patches": patches, "sharpen": np.array(True)})
+        np.testing.assert_allclose(mean, wanted.mean_px, atol=1e-3)
+        np.testing.assert_allclose(cov, wanted.cov_px, rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(visible, wanted.visible.sigmoid(), atol=1e-4)
+    pictures = random_pictures(SIZE, 2, seed=3)
+    assert [part.size for part in session.run(names, {"image": pictures})] == [0, 0, 0]
+    for mine, true in zip(answers(tmp_path / "model.onnx", pictures), told(path, pictures)):
+        np.testing.assert_allclose(mine, true, rtol=1e-3, atol=1e-3)  # the whole picture's as ever
+
+
+@pytest.mark.slow
+def test_a_model_that_does_not_look_at_corners_says_so(folder, tmp_path):
+    export(folder / "best.pt", tmp_path / "model.onnx")
+    detector = sf.KeypointDetector(tmp_path / "model.onnx")
+    assert not detector.sharpens
+    with pytest.raises(sf.InputError, match="does not look at corners"):
+        known = sf.GaussianKeypoints.from_sigma(np.eye(4, 2), 1.0)
+        detector.sharpened(np.zeros((SIZE, SIZE, 3), np.uint8), known)
 
 
 @pytest.mark.slow

@@ -160,6 +160,21 @@ def test_a_near_runways_far_end_is_looked_at_again_and_seen_sharper(pipeline, fr
     assert result.to_dict()["end_crops"] == [[c.left, c.top, c.width, c.height] for c in result.end_crops]
 
 
+def test_a_model_that_looks_at_corners_does_so_instead(pipeline, frame):
+    class Sharp(sf.KeypointDetector):
+        sharpens = True
+
+        def sharpened(self, image, keypoints, looks=2):
+            assert image is frame
+            return sf.GaussianKeypoints(keypoints.mean_px + 0.1, keypoints.cov_px / 4)
+
+    sharp = sf.LandingPipeline(Sharp(), RUNWAY, CAMERA).step(frame, box=BOX)
+    first = pipeline.detector.look(frame, sharp.crop).keypoints
+    np.testing.assert_allclose(sharp.keypoints.mean_px, first.mean_px + 0.1)
+    np.testing.assert_allclose(sharp.keypoints.cov_px, first.cov_px / 4)
+    assert sharp.end_crops == ()
+
+
 def test_a_runway_that_is_small_in_the_frame_is_looked_at_once(pipeline):
     # From 3 km the crop magnifies the frame: a larger one of an end would show no more.
     truth = approach_pose(0)

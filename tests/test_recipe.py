@@ -80,6 +80,7 @@ DAMAGE = [
     ({"likelihood": "beta", "covariance": "full"}, "likelihood: beta weighs coordinates one by one"),
     ({"learn": "covariance"}, "learn: covariance needs start, a checkpoint"),
     ({"learn": "where"}, "learn: where needs start, a checkpoint"),
+    ({"first_look": "m.onnx"}, "first_look: only learn = corners begins from one"),
     ({"crop": "tile"}, "crop: 'tile'; expected one of framed, native"),
 ]
 

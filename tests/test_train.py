@@ -15,6 +15,7 @@ import pytest
 
 import shortfinal as sf
 from shortfinal.data.dataset import Example, read_dataset, write_dataset
+from shortfinal.detector import shipped_model
 from shortfinal.errors import JobError
 from shortfinal.files import csv_text
 from shortfinal.keypoints import AIMING_NAMES
@@ -502,6 +503,39 @@ def test_learning_to_search_leaves_the_rest_as_it_is(recipe, scenes, done, tmp_p
     assert figures["where_loss"] < after["history"][0]["where_loss"]
     again = train(changed(recipe, tmp_path / "where", **changes))  # from its end
     assert again["where_loss"] == min(row["where_loss"] for row in after["history"])
+
+
+def test_learning_to_look_at_corners_leaves_the_rest_as_it_is(recipe, scenes, done, tmp_path):
+    searching = {"start": str(done[0] / "best.pt"), "learn": "where", "covariance": "keypoint"}
+    train(changed(recipe, tmp_path / "where", steps=1, **searching))
+    start = str(tmp_path / "where" / "last.pt")
+    changes = {"start": start, "learn": "corners", "covariance": "keypoint", "steps": 4, "validate_every": 2}
+    train(changed(recipe, tmp_path / "corners", **changes))
+    before, after = (load_checkpoint(path) for path in (start, tmp_path / "corners" / "last.pt"))
+    old, new = network_weights(before), network_weights(after)
+    for name in old:  # the search's part too
+        assert torch.equal(old[name], new[name]), name
+    assert {name.partition(".")[0] for name in set(new) - set(old)} == {"corners"}
+    figures = after["history"][-1]
+    assert figures["median_px"] == before["history"][-1]["median_px"]  # of the look at all, as it was
+    assert 0 <= figures["corner_coverage_68"] <= 1
+    again = train(changed(recipe, tmp_path / "corners", **changes))  # from its end
+    assert again["corner_nll"] == min(row["corner_nll"] for row in after["history"])
+    looking = changed(recipe, tmp_path / "looking", **changes, first_look=str(shipped_model()), weather=False)
+    for drawn, looked in zip(fit._Held(read_dataset(scenes / "b"), changed(looking, tmp_path, first_look="")),
+                             fit._Held(read_dataset(scenes / "b"), looking)):  # fmt: skip
+        assert drawn.image.shape == looked.image.shape == (4, 3, 48, 48)
+        if drawn.visible.all() and looked.visible.all():
+            assert not torch.equal(drawn.image, looked.image)
+    run = Run(changed(recipe, tmp_path / "again", **changes), 12)
+    run.begin(lambda: None)
+    draws = fit._Draws(read_dataset(scenes / "a"), run.recipe, range(1), 0, 4)
+    batch = Batch(*map(torch.stack, zip(*(draws[n] for n in range(4)))))
+    losses = []
+    for _ in range(20):  # the same corners
+        run.step, run.schedule.last_epoch = 3, 0
+        losses.append(run.advance(batch))
+    assert np.mean(losses[-5:]) < losses[0]
 
 
 def test_the_average_forgets_as_told(recipe, scenes, tmp_path):

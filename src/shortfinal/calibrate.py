@@ -14,10 +14,11 @@ from shortfinal.crops import box_around, centre_crop
 from shortfinal.data.augment import inside
 from shortfinal.data.dataset import LabelledDataset, read_dataset
 from shortfinal.data.labelled import Label, Picture
-from shortfinal.detector import Image, KeypointDetector, Look, ModelInfo, described
+from shortfinal.detector import Image, KeypointDetector, ModelInfo, described
 from shortfinal.errors import InputError
 from shortfinal.files import write_whole
 from shortfinal.geometry import PixelWindow
+from shortfinal.keypoints import GaussianKeypoints
 
 Array = NDArray[np.float64]
 
@@ -86,7 +87,10 @@ def _errors(detector: KeypointDetector, picture: Picture, labels: list[Label]) -
         truth[~inside(truth, width, height)] = np.nan
         window = framed(image, truth[:4], detector.info)
         if window is not None:
-            yield _in_crop(detector.look(image, window), truth)
+            keypoints = detector.look(image, window).keypoints
+            if detector.sharpens:
+                keypoints = detector.sharpened(image, keypoints)
+            yield _in_crop(window, keypoints, truth)
 
 
 def framed(image: Image, corners_px: Array, info: ModelInfo) -> PixelWindow | None:
@@ -96,7 +100,6 @@ def framed(image: Image, corners_px: Array, info: ModelInfo) -> PixelWindow | No
     return centre_crop(box_around(seen), info.margin, info.size) if len(seen) >= 2 else None
 
 
-def _in_crop(look: Look, truth: Array) -> tuple[Array, Array]:
-    found = look.keypoints
-    error = look.window.apply(found.mean_px) - look.window.apply(truth)
-    return error.ravel(), (found.sigma_px * look.window.scale).ravel()
+def _in_crop(window: PixelWindow, found: GaussianKeypoints, truth: Array) -> tuple[Array, Array]:
+    error = window.apply(found.mean_px) - window.apply(truth)
+    return error.ravel(), (found.sigma_px * window.scale).ravel()

@@ -18,6 +18,13 @@ from shortfinal.geometry import PixelWindow, as_array
 Array = NDArray[np.float64]
 Crop = Literal["framed", "native", "tile"]  # ways to cut training pictures: data/augment.py
 
+PATCH_PX = 48  # side of the patch that shows one corner
+_ACROSS, _ALONG = (1, 0, 3, 2), (3, 2, 1, 0)  # each corner's neighbour at the same end, and on the same side
+_HALF_PX = 24.0  # of a patch: so many pixels of the image to either side, less where the end is not as wide,
+_OF_WIDTH = 0.25  # more where this share of its width is more,
+_SIGMAS = 5.0  # or so many sigma of where the corner is
+_NARROWEST = math.sin(math.radians(25.0))  # between a patch's axes: flatter ones would show next to nothing
+
 
 def box_around(px: ArrayLike) -> Array:
     """The box (4,) left, top, right, bottom in pixels that holds keypoints (K, 2)."""
@@ -153,6 +160,35 @@ def inverse_crop(
     room = rooms[rng.choice(4, p=areas / areas.sum())]
     left, top = rng.uniform(room[:2], room[2:])
     return PixelWindow(float(left), float(top), side, side, size, size)
+
+
+def corner_patches(corners_px: ArrayLike, sigma_px: ArrayLike) -> Array:
+    """Where to look for each corner by itself: affine maps (4, 2, 3) from a patch's pixels (u, v, 1) to the image's.
+
+    A patch is centred on where a first look puts the corner (4, 2), give or take `sigma_px` (4, 2). Its x axis runs
+    along the end, towards the other corner there, its y axis along the edge, towards the other end: a corner looks
+    alike from wherever it is seen, left or right, near or far, the runway always in the same quadrant.
+    """
+    corners, sigma = as_array(corners_px, (4, 2), "corners_px"), as_array(sigma_px, (4, 2), "sigma_px")
+    maps = np.empty((4, 2, 3))
+    for corner, (across, along) in enumerate(zip(_ACROSS, _ALONG, strict=True)):
+        here = corners[corner]
+        x, width = _direction(corners[across] - here)
+        y, _ = _direction(corners[along] - here)
+        turn = x[0] * y[1] - x[1] * y[0]
+        if abs(turn) < _NARROWEST:
+            normal = np.array([-x[1], x[0]]) * (1 if turn >= 0 else -1)
+            y = (1 if x @ y >= 0 else -1) * math.sqrt(1 - _NARROWEST**2) * x + _NARROWEST * normal
+        half = max(min(_HALF_PX, width), _OF_WIDTH * width, _SIGMAS * float(sigma[corner].max()), 2.0)
+        axes = np.column_stack([x, y]) * (half / (PATCH_PX / 2))
+        maps[corner] = np.column_stack([axes, here - axes @ np.full(2, (PATCH_PX - 1) / 2)])
+    return maps
+
+
+def _direction(vector: Array) -> tuple[Array, float]:
+    """A vector (2,) as one of length 1, and its length; to the right, if it has none."""
+    length = float(np.hypot(*vector))
+    return (vector / length, length) if length > 0 else (np.array([1.0, 0.0]), 0.0)
 
 
 def _positions(low: float, high: float, keep: float, side: float, extent: float | None) -> tuple[float, float]:

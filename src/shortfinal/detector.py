@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shortfinal.calibration import Calibration
+from shortfinal.crops import PATCH_PX, corner_patches
 from shortfinal.errors import InputError
 from shortfinal.geometry import PixelWindow, frozen
 from shortfinal.keypoints import CORNER_NAMES, GaussianKeypoints
@@ -33,6 +34,11 @@ OUTPUTS = ("mean_px", "cov_px", "visible", "present")
 # The output of a model that can search, (2, H, W): probability and longer side of a runway's box, px. Made only on
 # request, an optional input: a look at a crop does not pay for it.
 WHERE, SEARCH = "where", "search"
+# The outputs of a model that looks at each corner by itself, made on request from patches (N, 4, 3, P, P): both inputs
+# are optional.
+CORNER_OUTPUTS, PATCHES, SHARPEN = ("corner_px", "corner_cov_px", "corner_visible"), "patches", "sharpen"
+CORNER_LOOKS = 2  # at each corner: the second from where the first put it
+VISIBLE = 0.5  # probability from which on a corner counts as seen
 SPOT = 0.25  # probability of a cell from which on it may hold the centre of a runway
 COVARIANCES = ("diagonal", "keypoint", "full")
 Precision = Literal["fp32", "fp16", "int8"]
@@ -190,6 +196,34 @@ class KeypointDetector:
             found += _spots(window, share, side)
         return sorted(found, reverse=True)
 
+    @property
+    def sharpens(self) -> bool:
+        """Whether the model looks at each corner by itself (`sharpened`)."""
+        return any(output.name == CORNER_OUTPUTS[0] for output in self._session.get_outputs())
+
+    def sharpened(self, image: Image, keypoints: GaussianKeypoints, looks: int = CORNER_LOOKS) -> GaussianKeypoints:
+        """Keypoints with their corners looked at again, each in a patch of its own at the image's resolution
+        (`crops.corner_patches`), so many times. One that is not seen there stays as it is. What this says of the
+        corners stands in place of what was known, and is independent of the keypoints beyond them.
+
+        Raises InputError as `look`, and for a model that does not look at corners.
+        """
+        check_image(image)
+        if not self.sharpens:
+            raise InputError("the model does not look at corners by themselves: train it with learn = corners")
+        info, known = self.info, keypoints
+        pixels = np.empty((1, 4, 3, PATCH_PX, PATCH_PX), np.float32)
+        for _ in range(looks):
+            maps = corner_patches(known.mean_px[:4], known.sigma_px[:4])
+            for corner, image_from_patch in enumerate(maps):
+                patch = warp_image(image, image_from_patch, (PATCH_PX, PATCH_PX))
+                normalise(patch, info.mean, info.std, out=pixels[0, corner])
+            nothing = np.empty((0, 3, info.size, info.size), np.float32)
+            inputs = {"image": nothing, PATCHES: pixels, SHARPEN: np.array(True)}
+            (mean,), (cov,), (visible,) = self._answers(CORNER_OUTPUTS, inputs)
+            known = _put_back(known, maps, mean, cov, visible, self._gain)
+        return known
+
     def _run(self, image: Image, windows: Sequence[PixelWindow], outputs: Sequence[str]) -> list[Any]:
         """Those outputs of the network (B, ...) for several windows of an image."""
         check_image(image)
@@ -203,9 +237,11 @@ class KeypointDetector:
             normalise(crop_image(image, window), info.mean, info.std, out=pixels)
         if not windows:
             return [[] for _ in outputs]
+        return self._answers(outputs, {"image": batch} | ({SEARCH: np.array(True)} if WHERE in outputs else {}))
+
+    def _answers(self, outputs: Sequence[str], inputs: dict[str, Any]) -> list[Any]:
         try:
-            asked = {SEARCH: np.array(True)} if WHERE in outputs else {}
-            answers: list[Any] = self._session.run(outputs, {"image": batch, **asked})
+            answers: list[Any] = self._session.run(outputs, inputs)
         except Exception as error:  # ONNX Runtime has no common base class for what it raises
             raise InputError(f"the model failed: {str(error).splitlines()[0][:120]}") from error
         return answers
@@ -221,6 +257,26 @@ class KeypointDetector:
             cov *= self._gain
         keypoints = GaussianKeypoints(window.inverse(mean), window.inverse_cov(cov))
         return Look(window, keypoints, frozen(probabilities[:-1]), float(present))
+
+
+def _put_back(
+    known: GaussianKeypoints, maps: Array, mean: Any, cov: Any, visible: Any, gain: Array | None
+) -> GaussianKeypoints:
+    """Keypoints with the corners that are visible in their patches: what the network says of those, in the image."""
+    seen = np.flatnonzero(visible >= VISIBLE)
+    new_mean, new_cov = known.mean_px.copy(), known.cov_px.copy()
+    axes = maps[:, :, :2]
+    new_mean[seen] = ((axes @ mean[:, :, None].astype(np.float64))[..., 0] + maps[:, :, 2])[seen]
+    turn = np.zeros((8, 8))
+    for corner in range(4):
+        turn[2 * corner : 2 * corner + 2, 2 * corner : 2 * corner + 2] = axes[corner]
+    rows = np.repeat(2 * seen, 2) + np.tile([0, 1], len(seen))
+    new_cov[rows], new_cov[:, rows] = 0.0, 0.0
+    spread = turn @ cov.astype(np.float64) @ turn.T
+    if gain is not None:
+        spread *= gain[:8, :8]
+    new_cov[np.ix_(rows, rows)] = ((spread + spread.T) / 2)[np.ix_(rows, rows)]
+    return GaussianKeypoints(new_mean, new_cov)
 
 
 def _spots(window: PixelWindow, share: Any, side: Any) -> list[Spot]:
@@ -348,6 +404,9 @@ def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo, str]:
     wanted = dict(zip(OUTPUTS, ((k, 2), (2 * k, 2 * k), (k,), ()), strict=True))
     on_request = {given.name for given in session.get_overridable_initializers()}
     fits = all(outputs.get(name) == wanted[name] for name in OUTPUTS) and (WHERE in outputs) == (SEARCH in on_request)
+    if CORNER_OUTPUTS[0] in outputs:
+        sizes = [outputs.get(name) for name in CORNER_OUTPUTS]
+        fits = fits and sizes == [(4, 2), (8, 8), (4,)] and {PATCHES, SHARPEN} <= on_request
     if shape != (3, info.size, info.size) or not fits:
         given = ", ".join(f"{name} {sizes}" for name, sizes in outputs.items())
         raise InputError(f"{source}: it takes {shape} and gives {given}, unlike its description; export it again")

@@ -428,12 +428,15 @@ def _spot_of(sight: Sight) -> Spot:
 def _sharpened(
     detector: KeypointDetector, frame: Image, look: Look
 ) -> tuple[GaussianKeypoints, tuple[PixelWindow, ...]]:
-    """The keypoints with each end from a look of its own, where that shows it larger; and those looks' windows.
+    """The keypoints with each corner from looks of its own, if the model knows how. If not, with each end from one,
+    where that shows it larger; and those looks' windows.
 
     The crop that holds the whole of a near runway shows its far end, on which the monitor's power
     rests, a few pixels wide. What two looks say of two ends is taken as independent.
     """
     known = look.keypoints
+    if detector.sharpens:
+        return detector.sharpened(frame, known), ()
     if look.window.scale[0] >= MAGNIFIED:
         return known, ()
     windows = {end: _around_end(known, end, detector.info.size) for end in range(len(ENDS))}

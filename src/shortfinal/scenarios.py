@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from shortfinal.crops import box_around
 from shortfinal.demo import RUNWAY, demo_scene
-from shortfinal.detector import KeypointDetector, Look, Spot, shipped_model
+from shortfinal.detector import CORNER_LOOKS, KeypointDetector, Look, Spot, shipped_model
 from shortfinal.files import sha256_of
 from shortfinal.geometry import Camera, PixelWindow, Pose, project
 from shortfinal.integrity import Decision
@@ -366,8 +366,9 @@ class _Locked:
 
     def __init__(self, detector: KeypointDetector, approach: Approach) -> None:
         self._detector, self._approach = detector, approach
-        self.info, self.calibration, self.searches = detector.info, detector.calibration, detector.searches
-        self.frame, self.sha256 = 0, detector.sha256
+        self.info, self.calibration, self.sha256 = detector.info, detector.calibration, detector.sha256
+        self.searches, self.sharpens = detector.searches, detector.sharpens
+        self.frame = 0
 
     def spots(self, image: Image, windows: Sequence[PixelWindow]) -> list[Spot]:
         return self._detector.spots(image, windows)
@@ -377,15 +378,24 @@ class _Locked:
 
     def look_all(self, image: Image, windows: Sequence[PixelWindow]) -> list[Look]:
         looks = self._detector.look_all(image, windows)
-        if not _frame_at(BEGIN_S) <= self.frame < _frame_at(END_S):
-            return looks
-        seen = project(CAMERA, self._approach.poses[self.frame], [RUNWAY.corners[1], _TAXIWAY_EDGE_M])
+        return [replace(look, keypoints=_moved(look.keypoints, self._shift)) for look in looks]
+
+    def sharpened(self, image: Image, keypoints: GaussianKeypoints, looks: int = CORNER_LOOKS) -> GaussianKeypoints:
+        true = self._detector.sharpened(image, _moved(keypoints, -self._shift), looks)
+        return _moved(true, self._shift)
+
+    @property
+    def _shift(self) -> Array:
+        """By how much it is off in this frame (4, 2), px."""
         shift = np.zeros((len(RUNWAY.corners), 2))
-        shift[1] = seen[1] - seen[0]
-        return [
-            replace(look, keypoints=GaussianKeypoints(look.keypoints.mean_px + shift, look.keypoints.cov_px))
-            for look in looks
-        ]
+        if _frame_at(BEGIN_S) <= self.frame < _frame_at(END_S):
+            here, there = project(CAMERA, self._approach.poses[self.frame], [RUNWAY.corners[1], _TAXIWAY_EDGE_M])
+            shift[1] = there - here
+        return shift
+
+
+def _moved(keypoints: GaussianKeypoints, shift_px: Array) -> GaussianKeypoints:
+    return GaussianKeypoints(keypoints.mean_px + shift_px, keypoints.cov_px)
 
 
 class _Trouble:

@@ -15,9 +15,20 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shortfinal.crops import Crop, bogo_crop, box_around, inverse_crop, native_crop, random_margin, search_crop
+from shortfinal.crops import (
+    PATCH_PX,
+    Crop,
+    bogo_crop,
+    box_around,
+    centre_crop,
+    corner_patches,
+    inverse_crop,
+    native_crop,
+    random_margin,
+    search_crop,
+)
 from shortfinal.data.dataset import Example
-from shortfinal.detector import warp_image
+from shortfinal.detector import KeypointDetector, warp_image
 from shortfinal.geometry import PixelWindow
 from shortfinal.keypoints import CORNER_NAMES, mirrored
 from shortfinal.scene.sensor import expose, random_sensor, to_8_bit
@@ -28,6 +39,9 @@ Light = NDArray[np.float32]
 
 MIRRORED, ROTATED, OVERHANGING, ELSEWHERE, CUT = 0.5, 0.3, 0.05, 0.08, 0.06  # probabilities
 SENSOR_RATE = 0.4  # of random_sensor's effects: the pictures have been through one already
+_CORNER_SCALES = (0.4, 1.5)  # pixels of the picture that corners are looked at in, per pixel of the example
+_CORNER_SIDES = (40, 320)  # of that picture
+_FIRST_LOOK = (0.0015, 0.04)  # its sigma, as a share of that picture's side
 _MOST_TURN_DEG = 7.0
 _CLEAR_PX = 6.0  # a drop stays this far from the corners before it may bend the picture
 
@@ -177,6 +191,57 @@ def augmented_crop(
         if rng.random() < effect.probability:
             crop = effect.apply(crop, seen, rng)
     return crop, places
+
+
+def corner_looks(
+    example: Example, rng: np.random.Generator, weather: bool = True, detector: KeypointDetector | None = None
+) -> tuple[NDArray[np.uint8], Array, Array]:
+    """Patches (4, P, P, 3) around where a first look puts an example's corners, as another camera in other weather saw
+    them; where the corners are in them (4, 2), NaN where they are not in the picture; and pixels of each patch per
+    pixel of the picture (4,).
+
+    The first look is the `detector`'s, half the time with one at each corner after it, as in use: it errs where the
+    picture misleads. Without a detector it is drawn.
+    """
+    corners = within(example)[:4]
+    seen = corners[np.isfinite(corners).all(axis=1)]
+    shrunk = float(np.exp(rng.uniform(*np.log(_CORNER_SCALES))))
+    side = 64 if len(seen) < 2 else int(np.clip(1.5 * shrunk * np.ptp(seen, axis=0).max(), *_CORNER_SIDES))
+    picture, corners = augmented_crop(example, side, rng, weather=weather)
+    corners = np.where(inside(corners, side, side)[:, None], corners, np.nan)[:4]
+    around = np.where(np.isfinite(corners), corners, rng.uniform(0, side, (4, 2)))
+    found, said = _drawn(around, side, rng) if detector is None else _looked(detector, picture, around, rng)
+    maps = corner_patches(found, said)
+    patches = np.stack([warp_image(picture, each, (PATCH_PX, PATCH_PX)) for each in maps])
+    axes = maps[:, :, :2]
+    places = np.asarray(np.linalg.solve(axes, (corners - maps[:, :, 2])[..., None])[..., 0], np.float64)
+    scale: Array = 1 / np.sqrt(np.abs(np.linalg.det(axes)))
+    return patches, places, scale
+
+
+def _drawn(around: Array, side: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """A first look at corners (4, 2) in a picture of that side, and its sigma (4, 2).
+
+    It errs as one (the runway moved and stretched) and for each corner by itself, by as much as it says, more or
+    less, and at times by far more.
+    """
+    said = side * float(np.exp(rng.uniform(*np.log(_FIRST_LOOK)))) * np.exp(rng.normal(0, 0.3, (4, 1)))
+    heavy = np.sqrt(4.0 / rng.chisquare(4.0))  # Student's t: first looks' errors have such tails
+    common = rng.uniform(0, 1)
+    moved = common * rng.normal(0, 1, 2) + common * rng.normal(0, 1) * (around - around.mean(axis=0)) / side
+    found = around + heavy * said * (moved + np.sqrt(1 - common**2) * rng.normal(0, 1, (4, 2)))
+    return found, np.repeat(said, 2, axis=1)
+
+
+def _looked(detector: KeypointDetector, picture: Image, around: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """What a model makes of a picture with corners (4, 2), and its sigma (4, 2)."""
+    box = box_around(around)
+    side = float((box[2:] - box[:2]).max())
+    shift = np.tile(rng.uniform(-0.06, 0.06, 2) * side, 2)
+    keypoints = detector.look(picture, centre_crop(box + shift, rng.uniform(1.3, 1.7), detector.info.size)).keypoints
+    if detector.sharpens and rng.random() < 0.5:
+        keypoints = detector.sharpened(picture, keypoints, 1)
+    return keypoints.mean_px[:4], keypoints.sigma_px[:4]
 
 
 def haze(crop: Image, corners: Array, rng: np.random.Generator) -> Image:

@@ -18,15 +18,19 @@ import onnx_ir
 import onnxruntime
 import torch
 from numpy.typing import NDArray
-from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
+from onnx import ModelProto, NodeProto, TensorProto, ValueInfoProto, compose, helper, numpy_helper
 from torch import Tensor, nn
 
 from shortfinal.calibrate import framed
+from shortfinal.crops import PATCH_PX
 from shortfinal.data.dataset import read_dataset
 from shortfinal.detector import (
+    CORNER_OUTPUTS,
     FORMAT,
     OUTPUTS,
+    PATCHES,
     SEARCH,
+    SHARPEN,
     WHERE,
     ModelInfo,
     Precision,
@@ -37,7 +41,7 @@ from shortfinal.detector import (
 from shortfinal.errors import InputError, JobError
 from shortfinal.files import write_whole
 from shortfinal.train.fit import load_checkpoint, network_of, network_weights
-from shortfinal.train.model import KeypointNet
+from shortfinal.train.model import Corners, KeypointNet, Prediction
 
 Array = NDArray[np.float64]
 Pictures = NDArray[np.float32]  # (N, 3, S, S), normalised
@@ -95,15 +99,28 @@ class Network(nn.Module):
         return (*answer, torch.stack([told.where[:, 0].sigmoid(), told.where[:, 1].clamp(0, 7).exp()], dim=1))
 
 
+class _CornerNetwork(nn.Module):
+    """What the model file computes of patches: (N, 4, 3, P, P) to CORNER_OUTPUTS."""
+
+    def __init__(self, corners: Corners) -> None:
+        super().__init__()
+        self.corners = corners
+
+    def forward(self, patches: Tensor) -> tuple[Tensor, ...]:
+        told: Prediction = self.corners(patches)
+        return told.mean_px, told.cov_px, told.visible.sigmoid()
+
+
 def load_network(checkpoint: str | Path) -> tuple[Network, dict[str, Any]]:
     """The averaged network of a checkpoint, ready for inference, and the checkpoint's content.
 
     Raises InputError for a file that is no checkpoint, or whose weights are not of its recipe's network.
     """
     state = load_checkpoint(checkpoint)
-    net = network_of(state["recipe"])
+    weights = network_weights(state)
+    net = network_of(state["recipe"], weights)
     try:
-        net.load_state_dict(network_weights(state))
+        net.load_state_dict(weights)
     except RuntimeError as error:
         raise InputError(f"{checkpoint}: its weights are not those of the network in its recipe") from error
     return Network(net).eval(), state
@@ -142,6 +159,8 @@ def export(
             f"allowed are {LIMITS[precision]}; not written"
         )
     info.figures.update({f"export_{name}": value for name, value in difference._asdict().items()})
+    if network.net.corners is not None:
+        model = _with_corners(model, network.net.corners)
     write_whole(target, described(_stripped(model).SerializeToString(), info))
     return info
 
@@ -207,6 +226,55 @@ def _on_request(model: ModelProto) -> ModelProto:
     return conditional
 
 
+def _with_corners(model: ModelProto, corners: Corners) -> ModelProto:
+    """With the network that looks at each corner beside it, in float32; it has an input and outputs of its own.
+
+    Both are optional, PATCHES and SHARPEN, which is false if not given; then it is not computed. Raises JobError if
+    ONNX Runtime and torch differ by more than the limits.
+    """
+    network = _CornerNetwork(corners).eval()
+    looks = torch.export.Dim("looks", min=1, max=4096)
+    patches = random_pictures(PATCH_PX, 4 * _BATCH).reshape(-1, 4, 3, PATCH_PX, PATCH_PX)
+    program = torch.onnx.export(
+        network, (torch.from_numpy(patches[:2]),), input_names=[PATCHES], output_names=list(CORNER_OUTPUTS),
+        dynamo=True, dynamic_shapes={PATCHES: {0: looks}}, verbose=False,
+    )  # fmt: skip
+    assert program is not None
+    beside = program.model_proto
+    difference = compare(beside, patches, answers_of(network, patches))
+    if not difference.within(LIMITS["fp32"]):
+        raise JobError(f"the part that looks at corners differs from torch by {difference}; not written")
+    beside = compose.add_prefix(beside, "corners.", rename_inputs=False, rename_outputs=False)
+    joined = ModelProto()
+    joined.CopyFrom(model)
+    known = {(library.domain, library.version) for library in model.opset_import}
+    assert {(library.domain, library.version) for library in beside.opset_import} <= known, "of the same exporter"
+    graph, nodes = joined.graph, list(beside.graph.node)
+    for node in nodes:
+        node.output[:] = [f"{name}.asked" if name in CORNER_OUTPUTS else name for name in node.output]
+        node.input[:] = [f"{name}.asked" if name in CORNER_OUTPUTS else name for name in node.input]
+    graph.initializer.extend(beside.graph.initializer)
+    graph.input.extend(beside.graph.input)
+    graph.output.extend(beside.graph.output)
+    graph.input.append(helper.make_tensor_value_info(SHARPEN, TensorProto.BOOL, []))
+    graph.initializer.append(numpy_helper.from_array(np.zeros((1, *patches.shape[1:]), np.float32), PATCHES))
+    graph.initializer.append(numpy_helper.from_array(np.array(False), SHARPEN))
+    told, nothing = list[ValueInfoProto](), list[NodeProto]()
+    for output in beside.graph.output:
+        sizes = [size.dim_value for size in output.type.tensor_type.shape.dim[1:]]
+        told.append(helper.make_tensor_value_info(f"{output.name}.asked", TensorProto.FLOAT, None))
+        untold = numpy_helper.from_array(np.zeros((0, *sizes), np.float32), f"{output.name}.unasked")
+        nothing.append(helper.make_node("Constant", [], [untold.name], value=untold))
+    empty = [helper.make_tensor_value_info(node.output[0], TensorProto.FLOAT, None) for node in nothing]
+    graph.node.append(
+        helper.make_node(
+            "If", [SHARPEN], list(CORNER_OUTPUTS), then_branch=helper.make_graph(nodes, "patches", [], told),
+            else_branch=helper.make_graph(nothing, "no patches", [], empty),
+        )
+    )  # fmt: skip
+    return joined
+
+
 def _stripped(model: ModelProto) -> ModelProto:
     """Without what the exporter notes of each node: where it stood in the source, paths included."""
     for part in (*model.graph.node, *model.graph.input, *model.graph.output, *model.graph.value_info, model.graph):
@@ -236,7 +304,7 @@ def _crops(data: str | Path, info: ModelInfo) -> Pictures:
     return np.stack(crops)
 
 
-def answers_of(network: Network, pictures: Pictures) -> list[Array]:
+def answers_of(network: nn.Module, pictures: Pictures) -> list[Array]:
     """What torch answers: the arrays of its outputs."""
     with torch.inference_mode():
         answers = [network(torch.from_numpy(batch)) for batch in _batches(pictures)]
@@ -247,7 +315,8 @@ def compare(model: ModelProto, pictures: Pictures, wanted: list[Array]) -> Diffe
     """How far ONNX Runtime's answers are from those `wanted` (`answers_of`)."""
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     asked = {given.name: np.array(True) for given in session.get_overridable_initializers() if given.name == SEARCH}
-    answers = [session.run(None, {"image": batch, **asked}) for batch in _batches(pictures)]
+    image = session.get_inputs()[0].name
+    answers = [session.run(None, {image: batch, **asked}) for batch in _batches(pictures)]
     mean, cov, *scope = (np.concatenate(parts).astype(np.float64) for parts in zip(*answers, strict=True))
     true_mean, true_cov, *true_scope = wanted
     if len(scope) > len(OUTPUTS) - 2:  # where: lengths count as far as there is a runway
@@ -297,7 +366,6 @@ def _halved(model: ModelProto) -> ModelProto:
 
     Cut off and put back: given nodes to spare, ONNX Runtime's converter still rounds what lies between them.
     """
-    from onnx import compose
     from onnx.utils import Extractor
     from onnxruntime.transformers.float16 import convert_float_to_float16
 

@@ -7,7 +7,8 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields
+from dataclasses import MISSING, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,11 +23,11 @@ from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, Dataset
 
 from shortfinal.calibration import LEVELS, coverage
-from shortfinal.crops import box_around, centre_crop, native_crop, search_crop
-from shortfinal.data.augment import augmented_crop, inside, within
+from shortfinal.crops import PATCH_PX, box_around, centre_crop, native_crop, search_crop
+from shortfinal.data.augment import augmented_crop, corner_looks, inside, within
 from shortfinal.data.dataset import Example, LabelledDataset, read_dataset
 from shortfinal.data.formats import split_by_airport
-from shortfinal.detector import crop_image, normalise
+from shortfinal.detector import KeypointDetector, crop_image, normalise
 from shortfinal.errors import InputError, JobError
 from shortfinal.files import csv_text, make_folder, write_whole
 from shortfinal.geometry import PixelWindow
@@ -35,23 +36,22 @@ from shortfinal.train.model import KeypointNet, Prediction
 from shortfinal.train.recipe import Recipe, to_dict
 from shortfinal.train.weights import FOLDED_MEAN, FOLDED_STD, first_line, load_weights, reading
 
+PARTS = ("where", "corners")  # of a network that learns them last, all else as it is
 _RISE = 0.03  # share of the steps in which the learning rate rises
 
 
 class Batch(NamedTuple):
-    """Crops, where their corners are, and how much they were enlarged."""
+    """Crops, where their corners are, and how much they were enlarged; or patches, of one corner each."""
 
-    image: Tensor  # (B, 3, S, S)
+    image: Tensor  # (B, 3, S, S), or (B, 4, 3, P, P)
     corners_px: Tensor  # (B, K, 2); anything where not visible
     visible: Tensor  # (B, K) 0 or 1: labelled, and in the picture and the crop
     box_px: Tensor  # (B, 4) left, top, right, bottom around the corners, also beyond the crop; NaN: not in the picture
-    scale: Tensor  # (B,) pixels of the crop per pixel of the picture
+    scale: Tensor  # (B,) pixels of the crop per pixel of the picture; or (B, 4), of each patch
 
     def to(self, device: Any) -> Batch:
-        """On another device, pictures with their channels last."""
-        return Batch(
-            self.image.to(device).contiguous(memory_format=torch.channels_last), *(part.to(device) for part in self[1:])
-        )
+        """On another device, crops with their channels last."""
+        return Batch(_channels_last(self.image.to(device)), *(part.to(device) for part in self[1:]))
 
 
 class _Draws(Dataset[Batch]):
@@ -62,6 +62,7 @@ class _Draws(Dataset[Batch]):
     def __init__(self, examples: LabelledDataset, recipe: Recipe, steps: range, rank: int, share: int) -> None:
         self.examples, self.recipe, self.steps, self.rank, self.share = examples, recipe, steps, rank, share
         self._turn, self._order = -1, np.empty(0, int)
+        self._first = _FirstLook(recipe)
 
     def __len__(self) -> int:
         return len(self.steps) * self.share
@@ -72,6 +73,8 @@ class _Draws(Dataset[Batch]):
         number = self.steps[step] * recipe.batch + self.rank * self.share + place
         rng = np.random.default_rng([recipe.seed, 1, number])
         example = self.examples[self._pick(number)]
+        if recipe.learn == "corners":
+            return _patches(example, rng, recipe, recipe.weather, self._first.detector)
         crop, corners = augmented_crop(example, recipe.size, rng, kind=recipe.cut, weather=recipe.weather)
         return _labelled(crop, corners, 1.0, recipe)
 
@@ -88,7 +91,7 @@ class _Held(Dataset[Batch]):
     """The held-out pictures, or so many of them from beginning to end: framed at the centre, or as the recipe crops."""
 
     def __init__(self, examples: LabelledDataset, recipe: Recipe) -> None:
-        self.examples, self.recipe = examples, recipe
+        self.examples, self.recipe, self._first = examples, recipe, _FirstLook(recipe)
 
     def __len__(self) -> int:
         return min(len(self.examples), self.recipe.validation_count)
@@ -96,6 +99,9 @@ class _Held(Dataset[Batch]):
     def __getitem__(self, index: int) -> Batch:
         number = index * len(self.examples) // len(self)
         example = self.examples[number]
+        if self.recipe.learn == "corners":
+            rng = np.random.default_rng([self.recipe.seed, 2, number])
+            return _patches(example, rng, self.recipe, False, self._first.detector)
         window = held_out_window(example, self.recipe, number)
         corners = window.apply(within(example))
         return _labelled(crop_image(example.image, window), corners, window.scale[0], self.recipe)
@@ -118,14 +124,42 @@ def held_out_window(example: Example, recipe: Recipe, index: int) -> PixelWindow
 
 
 def _labelled(crop: np.ndarray[Any, Any], corners: np.ndarray[Any, Any], scale: float, recipe: Recipe) -> Batch:
-    mean, std = (tuple(float(v) for v in values) for values in (recipe.mean, recipe.std))
     visible = inside(corners, recipe.size, recipe.size)  # NaN is not
     places = np.where(visible[:, None], corners, 0.0).astype(np.float32)
     return Batch(
-        torch.from_numpy(normalise(crop, mean, std)), torch.from_numpy(places),
+        _normalised(crop, recipe), torch.from_numpy(places),
         torch.from_numpy(visible.astype(np.float32)), torch.from_numpy(_box(corners)),
         torch.tensor(scale, dtype=torch.float32),
     )  # fmt: skip
+
+
+class _FirstLook:
+    """The model that looks before the corners are looked at; loaded where it is used, in a worker's process."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self._path = recipe.first_look
+
+    @cached_property
+    def detector(self) -> KeypointDetector | None:
+        return KeypointDetector(self._path, threads=1) if self._path else None
+
+
+def _patches(
+    example: Example, rng: np.random.Generator, recipe: Recipe, weather: bool, detector: KeypointDetector | None
+) -> Batch:
+    patches, corners, scale = corner_looks(example, rng, weather, detector)
+    batch = _labelled(patches[0], corners, 1.0, replace(recipe, size=PATCH_PX))
+    pictures = torch.stack([_normalised(patch, recipe) for patch in patches])
+    return batch._replace(image=pictures, scale=torch.from_numpy(scale.astype(np.float32)))
+
+
+def _normalised(crop: np.ndarray[Any, Any], recipe: Recipe) -> Tensor:
+    mean, std = (tuple(float(v) for v in values) for values in (recipe.mean, recipe.std))
+    return torch.from_numpy(normalise(crop, mean, std))
+
+
+def _channels_last(image: Tensor) -> Tensor:
+    return image.contiguous(memory_format=torch.channels_last) if image.dim() == 4 else image
 
 
 def _box(corners: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -192,7 +226,7 @@ def figures_of(prediction: Prediction, batch: Batch) -> dict[str, float]:
     nll = gaussian_nll(prediction.mean_px - batch.corners_px, prediction.sigma_px, prediction.factor, batch.visible)
     error = (prediction.mean_px - batch.corners_px)[seen]
     sigma, size = prediction.sigma_px[seen], error.abs()
-    native = size / batch.scale[:, None, None].expand_as(batch.corners_px)[seen]
+    native = size / batch.scale.reshape(len(batch.scale), -1, 1).expand_as(batch.corners_px)[seen]
     far = (prediction.mean_px - batch.corners_px).abs()[:, 2:4][seen[:, 2:4]]
     covered = coverage(error.cpu().numpy(), sigma.cpu().numpy(), LEVELS)
     figures = {
@@ -237,9 +271,9 @@ def predict(model: Callable[[Tensor], Prediction], batches: Iterable[Batch]) -> 
     answers, asked = [], []
     with torch.inference_mode():
         for batch in batches:
-            answer = model(batch.image.contiguous(memory_format=torch.channels_last))
+            answer = model(_channels_last(batch.image))
             answers.append(answer._replace(attention=None))
-            asked.append(batch._replace(image=batch.image[:, :, :0, :0]))
+            asked.append(batch._replace(image=batch.image[..., :0, :0]))
     parts: list[Any] = [None if c[0] is None else torch.cat(list(c)) for c in zip(*answers, strict=True)]
     return Prediction(*parts), Batch(*(torch.cat(list(column)) for column in zip(*asked, strict=True)))
 
@@ -262,8 +296,10 @@ class Run:
         )  # fmt: skip
         self.fabric.launch()
         torch.manual_seed(recipe.seed)
-        fresh = not (recipe.start or (self.folder / "last.pt").exists())
-        self.net = _network(recipe, pretrained=fresh and recipe.weights == "timm")
+        last = self.folder / "last.pt"
+        source = last if last.exists() else recipe.start
+        earlier = network_weights(load_checkpoint(source)) if source else None
+        self.net = _network(recipe, earlier, pretrained=earlier is None and recipe.weights == "timm")
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         for part in self.kept:
             part.requires_grad_(False)
@@ -277,14 +313,14 @@ class Run:
     @property
     def kept(self) -> list[torch.nn.Module]:
         """The parts of the network that do not learn."""
-        if self.recipe.learn == "where":
-            return [part for name, part in self.net.named_children() if name != "where"]
+        if self.recipe.learn in PARTS:
+            return [part for name, part in self.net.named_children() if name != self.recipe.learn]
         return self.net.means if self.recipe.learn == "covariance" else []
 
     @property
     def goal(self) -> str:
         """The figure that tells which network is the best."""
-        return "where_loss" if self.recipe.learn == "where" else "nll"
+        return {"where": "where_loss", "corners": "corner_nll"}.get(self.recipe.learn, "nll")
 
     def save(self, name: str) -> None:
         """Write a checkpoint whole or not at all."""
@@ -322,7 +358,7 @@ class Run:
             differ = [name for name in ("backbone", "head", "features", "mean", "std") if was[name] != now[name]]
             differ += [k for k, v in weights.items() if k not in mine or mine[k].shape != v.shape]
             # One that had no correlations, or did not say where, may become one that does.
-            differ += [k for k in mine if k not in weights and not k.startswith(("correlation.", "where."))]
+            differ += [k for k in mine if k not in weights and not k.startswith(("correlation.", *_prefixes(PARTS)))]
             if differ:
                 raise InputError(f"{recipe.start}: of another network ({differ[0]} differs)")
             self.net.load_state_dict(weights, strict=False)
@@ -337,6 +373,7 @@ class Run:
         """What this step minimises: a mean over the batch's pictures, so that processes can share it."""
         recipe = self.recipe
         prediction = self.model(batch.image)
+        size = PATCH_PX if recipe.learn == "corners" else recipe.size
         if recipe.learn == "where":
             return where_loss(prediction.where, batch.box_px, batch.visible, recipe.size).mean()
         error = (prediction.mean_px - batch.corners_px) * batch.visible[..., None]
@@ -349,8 +386,8 @@ class Run:
         if warming:
             loss = loss + 0.1 * error.abs().mean()
         if prediction.attention is not None and recipe.attention_weight:
-            told = attention_loss(prediction.attention, batch.corners_px, batch.visible, recipe.size).mean()
-            loss = loss + recipe.attention_weight * told / len(recipe.keypoints)
+            told = attention_loss(prediction.attention, batch.corners_px, batch.visible, size).mean()
+            loss = loss + recipe.attention_weight * told / batch.visible.shape[1]
         return loss + recipe.scope_weight * scope_loss(prediction, batch.visible).mean()
 
     def advance(self, batch: Batch) -> float:
@@ -384,18 +421,28 @@ class Run:
         self.save("last.pt")  # last of all: what is lost by a kill before it is done again, not twice
 
 
-def network_of(recipe: Mapping[str, Any], *, pretrained: bool = False) -> KeypointNet:
-    """The network that a recipe's plain values (`to_dict`, or a checkpoint's) describe."""
+def network_of(
+    recipe: Mapping[str, Any], weights: Mapping[str, Tensor] | None = None, *, pretrained: bool = False
+) -> KeypointNet:
+    """The network that a recipe's plain values (`to_dict`, or a checkpoint's) describe; with the further PARTS that
+    `weights`, by their names, have.
+    """
+    had = {key.partition(".")[0] for key in weights or ()}
+    parts = {name: recipe["learn"] == name or name in had for name in PARTS}
     return KeypointNet(
         recipe["backbone"], len(recipe["keypoints"]), recipe["head"], recipe["covariance"], recipe["features"],
-        recipe["width"], pretrained=pretrained, where=recipe["learn"] == "where",
+        recipe["width"], pretrained=pretrained, **parts,
     )  # fmt: skip
 
 
-def _network(recipe: Recipe, pretrained: bool) -> KeypointNet:
+def _prefixes(parts: Iterable[str]) -> tuple[str, ...]:
+    return tuple(f"{name}." for name in parts)
+
+
+def _network(recipe: Recipe, earlier: Mapping[str, Tensor] | None, pretrained: bool) -> KeypointNet:
     """The recipe's network, once tried. Raises InputError for a backbone that has no weights, or not this size."""
     try:
-        net = network_of(to_dict(recipe), pretrained=pretrained)
+        net = network_of(to_dict(recipe), earlier, pretrained=pretrained)
         with torch.no_grad():
             net.eval()(torch.zeros(1, 3, recipe.size, recipe.size))
     except InputError:
@@ -446,6 +493,9 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     if not isinstance(state, dict) or "recipe" not in state:
         raise InputError(f"{path}: a torch file, but not a checkpoint of shortfinal train")
     recipe = state["recipe"] if isinstance(state["recipe"], dict) else {}
+    # What recipes have learned to say since: what it was when nobody asked.
+    recipe = {field.name: field.default for field in fields(Recipe) if field.default is not MISSING} | recipe
+    state["recipe"] = recipe
     lacks = [key for key in (*Run._PARTS, "step", "history") if key not in state]
     lacks += [f"recipe.{field.name}" for field in fields(Recipe) if field.name not in recipe]
     if lacks or not state["history"]:
@@ -460,7 +510,7 @@ def network_weights(state: dict[str, Any]) -> dict[str, Tensor]:
 
 def _corner_figures(state: dict[str, Any]) -> dict[str, float]:
     """What a checkpoint says of its corners."""
-    return {k: v for k, v in state["history"][-1].items() if k not in ("step", "loss") and not k.startswith("where_")}
+    return {k: v for k, v in state["history"][-1].items() if k not in ("step", "loss")}
 
 
 def train(recipe: Recipe, console: Console | None = None) -> dict[str, float]:
@@ -527,6 +577,8 @@ def _validate(run: Run, examples: LabelledDataset) -> dict[str, float]:
     prediction, batch = predict(run.average, (batch.to(run.fabric.device) for batch in loader))
     if not (prediction.mean_px.isfinite().all() and prediction.sigma_px.isfinite().all()):
         raise JobError(f"diverged at step {run.step}; lower the learning rate")
+    if run.recipe.learn == "corners":
+        return run.figures | {f"corner_{name}": value for name, value in figures_of(prediction, batch).items()}
     if run.recipe.learn == "where":
         assert prediction.where is not None  # as the network has that part
         return run.figures | where_figures(prediction.where, batch, run.recipe.size)
@@ -545,4 +597,7 @@ def _bar(console: Console) -> Progress:
 
 def _brief(history: list[dict[str, float]]) -> str:
     last = history[-1] if history else None
-    return f" · held out: median {last['median_px']:.2f} px, nll {last['nll']:.3f}" if last else ""
+    if last is None:
+        return ""
+    part = "corner_" if "corner_nll" in last else ""
+    return f" · held out: median {last[f'{part}median_px']:.2f} px, nll {last[f'{part}nll']:.3f}"

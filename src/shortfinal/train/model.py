@@ -5,6 +5,7 @@ Where this departs from the paper: docs/paper.md. What was tried: docs/log.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, NamedTuple, get_args
@@ -21,6 +22,7 @@ Covariance = Literal["diagonal", "keypoint", "full"]
 
 MIN_SIGMA_PX = 0.03  # keeps the likelihood finite on a picture seen too often
 _FIRST_LOG_VARIANCE = 6.0  # a sigma of 20 px: an untrained network knows nothing
+_DIM = 0.1  # of RGB as normalised: what less contrast is taken as
 _HIDDEN = 64  # of the layers that turn pooled features into sigmas, correlations and logits
 
 
@@ -56,7 +58,7 @@ class KeypointNet(nn.Module):
     corner and the shallow ones say where. `covariance`: sigmas only, or also how the two coordinates
     of a keypoint correlate, or how all 2K do (by the Cholesky factor of the correlation matrix).
     `where`: also say where in the picture runways are, however small, for the search in whole frames;
-    it looks at the fused map.
+    it looks at the fused map. `corners`: also look at patches (B, 4, 3, P, P) of one corner each (`Corners`).
 
     Raises InputError for a backbone timm does not have, or without such feature maps, and for `where` without
     a fused map.
@@ -72,6 +74,7 @@ class KeypointNet(nn.Module):
         width: int = 48,
         pretrained: bool = False,
         where: bool = False,
+        corners: bool = False,
     ) -> None:
         super().__init__()
         for name, value, known in (("head", head, Head), ("covariance", covariance, Covariance)):
@@ -95,10 +98,15 @@ class KeypointNet(nn.Module):
         if where and (head != "sam" or len(channels) == 1):
             raise InputError("where: looks at the fused map; it needs the head sam and several features")
         self.where = Where(width) if where else None
+        self.corners = Corners(covariance) if corners else None
         self.correlation = _layers(told * keypoints, _HIDDEN, int(linked.sum())) if linked.any() else None
 
     def forward(self, image: Tensor) -> Prediction:
         """See the class."""
+        if image.dim() == 5:
+            assert self.corners is not None
+            told: Prediction = self.corners(image)
+            return told
         maps = self.backbone(image)
         fused = None if self.score is None else self.neck(maps if len(maps) > 1 else maps[0])
         with _single_precision(image.device.type):
@@ -131,14 +139,87 @@ class KeypointNet(nn.Module):
         return [part for part in (self.backbone, self.neck, self.score, self.fc) if part is not None]
 
     def _factor(self, told: Tensor) -> Tensor | None:
-        """The correlation's Cholesky factor: a unit lower triangle, its rows scaled to length one."""
-        if self.correlation is None:
-            return None
-        n = 2 * self.keypoints
-        below = self.correlation(told.flatten(1)) @ self.linked
-        lower = below.unflatten(1, (n, n)) + torch.eye(n, device=told.device)
-        factor: Tensor = lower / lower.norm(dim=2, keepdim=True)
-        return factor
+        return None if self.correlation is None else _factor(self.correlation(told.flatten(1)) @ self.linked)
+
+
+class Corners(nn.Module):
+    """Patches (B, 4, 3, P, P), one for each corner in its own frame (`crops.corner_patches`), to a `Prediction` in
+    pixels of those patches.
+
+    All corners look alike there, so that one small network knows them all. Together they give the covariance.
+    `visible`: the corner is in its patch; `present`: the likeliest of them.
+    """
+
+    def __init__(self, covariance: Covariance, width: int = 32) -> None:
+        super().__init__()
+        deep = 2 * width
+        self.shallow = nn.Sequential(_convolution(3, width // 2), _convolution(width // 2, width, 4, 2))
+        self.end = nn.Embedding(2, deep)  # the near one, the far one
+        self.down = _convolution(width, deep, 4, 2)
+        self.deep = nn.ModuleList([
+            nn.Sequential(_convolution(deep, deep), nn.Conv2d(deep, deep, 3, padding=1, bias=False),
+                          nn.BatchNorm2d(deep))
+            for _ in range(3)
+        ])  # fmt: skip
+        self.lateral, self.skip = nn.Conv2d(deep, width, 1), _convolution(width, width)
+        self.fused = nn.Sequential(_convolution(width, width), _convolution(width, width))
+        self.score = nn.Conv2d(width, 1, 1)
+        told = width + deep + 2  # the features where the corner is looked for, of the whole patch, how widely it is
+        self.spread = _layers(told, _HIDDEN, 3)
+        nn.init.constant_(self.spread[-1].bias[:2], _FIRST_LOG_VARIANCE / 2)  # type: ignore[index]
+        linked = _linked(4, covariance)
+        self.register_buffer("linked", torch.eye(linked.numel())[linked.flatten()], persistent=False)
+        self.correlation = _layers(4 * told, _HIDDEN, int(linked.sum())) if linked.any() else None
+
+    def forward(self, patches: Tensor) -> Prediction:
+        """See the class."""
+        size = patches.shape[-1]
+        image = patches.flatten(0, 1)
+        # A dark or a hazy corner is a corner: each patch by its own contrast.
+        level = image.mean(dim=(1, 2, 3), keepdim=True)
+        contrast = (image - level).square().mean(dim=(1, 2, 3), keepdim=True).add(_DIM**2).sqrt()
+        shallow = self.shallow(((image - level) / contrast).contiguous(memory_format=torch.channels_last))
+        end = torch.arange(4, device=image.device).div(2, rounding_mode="floor")
+        which = self.end(end).repeat(patches.shape[0], 1)  # not len(): the exporter would take it for fixed
+        deep = self.down(shallow) + which[:, :, None, None]
+        for layers in self.deep:
+            deep = functional.relu(deep + layers(deep))
+        up = functional.interpolate(self.lateral(deep), scale_factor=2.0, mode="bilinear", align_corners=False)
+        fused = self.fused(self.skip(shallow) + up)
+        with _single_precision(image.device.type):
+            return self._answer(deep.float(), fused.float(), size)
+
+    def _answer(self, deep: Tensor, fused: Tensor, size: int) -> Prediction:
+        attention = functional.log_softmax(self.score(fused).flatten(2), dim=-1)  # (4B, 1, H W)
+        weight = attention.exp()
+        mean, variance = soft_argmax(weight, *fused.shape[-2:])
+        local = weight @ fused.flatten(2).transpose(1, 2)
+        told = torch.cat([local[:, 0], deep.mean(dim=(2, 3)), variance[:, 0].clamp_min(1e-6).log()], dim=-1)
+        told = told.unflatten(0, (-1, 4))
+        spread = self.spread(told)
+        factor = None if self.correlation is None else _factor(self.correlation(told.flatten(1)) @ self.linked)
+        visible = spread[..., 2]
+        return Prediction(
+            mean.unflatten(0, (-1, 4))[:, :, 0] * size - 0.5, (spread[..., :2].exp() + MIN_SIGMA_PX**2).sqrt(), factor,
+            visible, visible.amax(dim=1), attention.unflatten(2, fused.shape[-2:]).unflatten(0, (-1, 4))[:, :, 0],
+        )  # fmt: skip
+
+
+def _factor(below: Tensor) -> Tensor:
+    """A correlation's Cholesky factor (B, n, n) from what is below its diagonal (B, n²): a unit lower triangle, its
+    rows scaled to length one.
+    """
+    n = math.isqrt(below.shape[1])
+    lower = below.unflatten(1, (n, n)) + torch.eye(n, device=below.device)
+    factor: Tensor = lower / lower.norm(dim=2, keepdim=True)
+    return factor
+
+
+def _convolution(inner: int, outer: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inner, outer, kernel, stride, (kernel - 1) // 2, bias=False), nn.BatchNorm2d(outer),
+        nn.ReLU(inplace=True),
+    )  # fmt: skip
 
 
 class Neck(nn.Module):

@@ -19,7 +19,7 @@ from shortfinal.train.model import Covariance, Head
 Framing = Literal["framed", "native"]
 Optimizer = Literal["adamw", "adam", "rmsprop"]
 Schedule = Literal["cosine", "constant"]
-Learn = Literal["all", "covariance", "where"]
+Learn = Literal["all", "covariance", "where", "corners"]
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 
 
@@ -50,8 +50,9 @@ class Recipe:
     # loss
     start: str = ""  # a checkpoint whose network to begin from
     # "covariance": backbone and means stay as they are, on pictures they were not trained on; "where": all but the
-    # search's part, which a network that has none gets.
+    # search's part, which a network that has none gets; "corners": all but the part that looks at each corner.
     learn: Learn = "all"
+    first_look: str = ""  # of "corners": the model file that looks first, as in use; none: looks are drawn
     likelihood: Likelihood = "half"
     warm_up: float = 0.1  # share of the steps in which the means learn without the variances
     attention_weight: float = 0.3  # of the loss that tells the attention where the corner is; 0: none, as published
@@ -89,6 +90,8 @@ class Recipe:
             raise InputError(f"likelihood: beta weighs coordinates one by one; covariance {self.covariance} has more")
         if self.learn != "all" and not self.start:
             raise InputError(f"learn: {self.learn} needs start, a checkpoint whose other parts are kept")
+        if self.first_look and self.learn != "corners":
+            raise InputError("first_look: only learn = corners begins from one")
 
     @property
     def cut(self) -> Crop:
