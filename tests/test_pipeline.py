@@ -196,7 +196,7 @@ def test_land_without_a_runway_is_said_to_be_none(pipeline):
 class Told:
     """A detector that says what it is told: eight keypoints, of which it sees some."""
 
-    calibration, searches = None, False
+    calibration, searches, sharpens = None, False, False
 
     def __init__(self, info, mean_px, visible):
         self.info = dataclasses.replace(info, keypoints=(*sf.CORNER_NAMES, *AIMING_NAMES))

@@ -72,7 +72,7 @@ def test_training_windows_are_the_searchs_own():
 class Finder:
     """A detector whose spots and looks are told: at each place of `runways`, the corners of one."""
 
-    calibration, searches = None, True
+    calibration, searches, sharpens = None, True, False
 
     def __init__(self, info, runways):
         self.info, self.runways, self.windows = info, runways, 0
