@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -18,7 +18,7 @@ import onnx_ir
 import onnxruntime
 import torch
 from numpy.typing import NDArray
-from onnx import ModelProto, NodeProto, TensorProto, ValueInfoProto, compose, helper, numpy_helper
+from onnx import ModelProto, NodeProto, TensorProto, compose, helper, numpy_helper
 from torch import Tensor, nn
 
 from shortfinal.calibrate import framed
@@ -206,24 +206,27 @@ def _on_request(model: ModelProto) -> ModelProto:
     kept = [node for node in graph.node if needed & set(node.output)]
     del graph.node[:]
     graph.node.extend(kept)
-    for node in others:
-        node.output[:] = [f"{name}.asked" if name == WHERE else name for name in node.output]
-    told = helper.make_tensor_value_info(f"{WHERE}.asked", TensorProto.FLOAT, None)
-    untold = numpy_helper.from_array(np.zeros((1, 2, 0, 0), np.float32), f"{WHERE}.unasked")
-    nothing = helper.make_node("Constant", [], [untold.name], value=untold)
-    graph.node.append(
-        helper.make_node(
-            "If", [SEARCH], [WHERE], then_branch=helper.make_graph(others, "asked", [], [told]),
-            else_branch=helper.make_graph(
-                [nothing], "unasked", [], [helper.make_tensor_value_info(untold.name, TensorProto.FLOAT, None)]
-            ),
-        )
-    )  # fmt: skip
+    graph.node.append(_asked(SEARCH, others, {WHERE: (1, 2, 0, 0)}))
     declared = next(output for output in graph.output if output.name == WHERE)
     declared.CopyFrom(helper.make_tensor_value_info(WHERE, TensorProto.FLOAT, ["batch", 2, "rows", "columns"]))
     graph.input.append(helper.make_tensor_value_info(SEARCH, TensorProto.BOOL, []))
     graph.initializer.append(numpy_helper.from_array(np.array(False), SEARCH))
     return conditional
+
+
+def _asked(condition: str, nodes: Sequence[NodeProto], outputs: Mapping[str, Sequence[int]]) -> NodeProto:
+    """The node that makes `outputs` by `nodes` where the input `condition` is true, and else nothing, of that shape."""
+    for node in nodes:
+        for names in (node.input, node.output):
+            names[:] = [f"{name}.asked" if name in outputs else name for name in names]
+    told = [helper.make_tensor_value_info(f"{name}.asked", TensorProto.FLOAT, None) for name in outputs]
+    nothing = [numpy_helper.from_array(np.zeros(size, np.float32), f"{n}.unasked") for n, size in outputs.items()]
+    constants = [helper.make_node("Constant", [], [tensor.name], value=tensor) for tensor in nothing]
+    untold = [helper.make_tensor_value_info(tensor.name, TensorProto.FLOAT, None) for tensor in nothing]
+    return helper.make_node(
+        "If", [condition], list(outputs), then_branch=helper.make_graph(nodes, f"{condition} asked", [], told),
+        else_branch=helper.make_graph(constants, f"{condition} not asked", [], untold),
+    )  # fmt: skip
 
 
 def _with_corners(model: ModelProto, corners: Corners) -> ModelProto:
@@ -249,29 +252,15 @@ def _with_corners(model: ModelProto, corners: Corners) -> ModelProto:
     joined.CopyFrom(model)
     known = {(library.domain, library.version) for library in model.opset_import}
     assert {(library.domain, library.version) for library in beside.opset_import} <= known, "of the same exporter"
-    graph, nodes = joined.graph, list(beside.graph.node)
-    for node in nodes:
-        node.output[:] = [f"{name}.asked" if name in CORNER_OUTPUTS else name for name in node.output]
-        node.input[:] = [f"{name}.asked" if name in CORNER_OUTPUTS else name for name in node.input]
+    graph = joined.graph
     graph.initializer.extend(beside.graph.initializer)
     graph.input.extend(beside.graph.input)
     graph.output.extend(beside.graph.output)
     graph.input.append(helper.make_tensor_value_info(SHARPEN, TensorProto.BOOL, []))
     graph.initializer.append(numpy_helper.from_array(np.zeros((1, *patches.shape[1:]), np.float32), PATCHES))
     graph.initializer.append(numpy_helper.from_array(np.array(False), SHARPEN))
-    told, nothing = list[ValueInfoProto](), list[NodeProto]()
-    for output in beside.graph.output:
-        sizes = [size.dim_value for size in output.type.tensor_type.shape.dim[1:]]
-        told.append(helper.make_tensor_value_info(f"{output.name}.asked", TensorProto.FLOAT, None))
-        untold = numpy_helper.from_array(np.zeros((0, *sizes), np.float32), f"{output.name}.unasked")
-        nothing.append(helper.make_node("Constant", [], [untold.name], value=untold))
-    empty = [helper.make_tensor_value_info(node.output[0], TensorProto.FLOAT, None) for node in nothing]
-    graph.node.append(
-        helper.make_node(
-            "If", [SHARPEN], list(CORNER_OUTPUTS), then_branch=helper.make_graph(nodes, "patches", [], told),
-            else_branch=helper.make_graph(nothing, "no patches", [], empty),
-        )
-    )  # fmt: skip
+    shapes = dict(zip(CORNER_OUTPUTS, ((0, 4, 2), (0, 8, 8), (0, 4)), strict=True))
+    graph.node.append(_asked(SHARPEN, list(beside.graph.node), shapes))
     return joined
 
 

@@ -7,7 +7,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import MISSING, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from lightning.fabric import Fabric
 from lightning.fabric.loggers.tensorboard import TensorBoardLogger
+from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
@@ -76,7 +77,7 @@ class _Draws(Dataset[Batch]):
         if recipe.learn == "corners":
             return _patches(example, rng, recipe, recipe.weather, self._first.detector)
         crop, corners = augmented_crop(example, recipe.size, rng, kind=recipe.cut, weather=recipe.weather)
-        return _labelled(crop, corners, 1.0, recipe)
+        return _labelled(_normalised(crop, recipe), corners, 1.0, recipe.size)
 
     def _pick(self, number: int) -> int:
         """Which example: each once in every pass over the data, in that pass's own order."""
@@ -104,7 +105,8 @@ class _Held(Dataset[Batch]):
             return _patches(example, rng, self.recipe, False, self._first.detector)
         window = held_out_window(example, self.recipe, number)
         corners = window.apply(within(example))
-        return _labelled(crop_image(example.image, window), corners, window.scale[0], self.recipe)
+        crop = _normalised(crop_image(example.image, window), self.recipe)
+        return _labelled(crop, corners, window.scale[0], self.recipe.size)
 
 
 def held_out_window(example: Example, recipe: Recipe, index: int) -> PixelWindow:
@@ -123,13 +125,12 @@ def held_out_window(example: Example, recipe: Recipe, index: int) -> PixelWindow
     return centre_crop(box_around(seen), recipe.margin, recipe.size)
 
 
-def _labelled(crop: np.ndarray[Any, Any], corners: np.ndarray[Any, Any], scale: float, recipe: Recipe) -> Batch:
-    visible = inside(corners, recipe.size, recipe.size)  # NaN is not
+def _labelled(image: Tensor, corners: np.ndarray[Any, Any], scale: ArrayLike, size: int) -> Batch:
+    visible = inside(corners, size, size)  # NaN is not
     places = np.where(visible[:, None], corners, 0.0).astype(np.float32)
     return Batch(
-        _normalised(crop, recipe), torch.from_numpy(places),
-        torch.from_numpy(visible.astype(np.float32)), torch.from_numpy(_box(corners)),
-        torch.tensor(scale, dtype=torch.float32),
+        image, torch.from_numpy(places), torch.from_numpy(visible.astype(np.float32)),
+        torch.from_numpy(_box(corners)), torch.as_tensor(np.asarray(scale, np.float32)),
     )  # fmt: skip
 
 
@@ -148,9 +149,7 @@ def _patches(
     example: Example, rng: np.random.Generator, recipe: Recipe, weather: bool, detector: KeypointDetector | None
 ) -> Batch:
     patches, corners, scale = corner_looks(example, rng, weather, detector)
-    batch = _labelled(patches[0], corners, 1.0, replace(recipe, size=PATCH_PX))
-    pictures = torch.stack([_normalised(patch, recipe) for patch in patches])
-    return batch._replace(image=pictures, scale=torch.from_numpy(scale.astype(np.float32)))
+    return _labelled(torch.stack([_normalised(patch, recipe) for patch in patches]), corners, scale, PATCH_PX)
 
 
 def _normalised(crop: np.ndarray[Any, Any], recipe: Recipe) -> Tensor:
