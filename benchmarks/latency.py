@@ -1,14 +1,13 @@
 """How long does one picture take? Networks in ONNX Runtime and OpenVINO, batch 1, on the processor.
 
-All models in both runtimes take turns, round after round, so that whatever else the machine does hits
-all alike. A turn of one call finds the caches as the others left them, as a network does between the
-rest of a pipeline; of a turn of several (`--in-a-row`) the first fills them, and the others count, as
-in most published figures. Two threads each, fp32. A row's ratio is to ResNet-18 in the same runtime. The
+All models in both runtimes take turns of one call, round after round, so that whatever else the
+machine does hits all alike; each finds the caches as the others left them, as a network does between
+the rest of a pipeline. Two threads each, fp32. A row's ratio is to ResNet-18 in the same runtime. The
 weights are random: they do not change how long a network takes. ResNets and EfficientNet as in the
 paper (arXiv 2508.09732), with the last feature map only; beside ours, the model file that ships, and
 any others that are named.
 
-    python benchmarks/latency.py [MODEL.onnx ...] [--rounds 300] [--in-a-row 1] [--threads 2] [--json]
+    python benchmarks/latency.py [MODEL.onnx ...] [--rounds 300] [--threads 2] [--json]
 """
 
 from __future__ import annotations
@@ -97,30 +96,23 @@ def _picture(size: int) -> NDArray[np.float32]:
     return np.random.default_rng(0).normal(size=(1, 3, size, size)).astype(np.float32)
 
 
-def measure(
-    calls: Mapping[Any, Call], rounds: int, warm_up: int = WARM_UP, in_a_row: int = 1
-) -> dict[Any, NDArray[np.float64]]:
-    """Milliseconds of each call, one after the other in another order each round: (rounds,), or, with several
-    `in_a_row`, of all but the first of each row.
-    """
+def measure(calls: Mapping[Any, Call], rounds: int, warm_up: int = WARM_UP) -> dict[Any, NDArray[np.float64]]:
+    """Milliseconds (rounds,) of each call, one after the other in another order each round."""
     order, names = np.random.default_rng(1), list(calls)
     times: dict[Any, list[float]] = {name: [] for name in names}
     for number in range(warm_up + rounds):
         for place in order.permutation(len(names)):
-            for call in range(in_a_row):
-                begin = time.perf_counter()
-                calls[names[place]]()
-                if number >= warm_up and call >= min(1, in_a_row - 1):
-                    times[names[place]].append(1e3 * (time.perf_counter() - begin))
+            begin = time.perf_counter()
+            calls[names[place]]()
+            if number >= warm_up:
+                times[names[place]].append(1e3 * (time.perf_counter() - begin))
     return {name: np.array(values) for name, values in times.items()}
 
 
-def table(
-    models: Mapping[str, Path], rounds: int, threads: int, warm_up: int = WARM_UP, in_a_row: int = 1
-) -> list[dict[str, Any]]:
+def table(models: Mapping[str, Path], rounds: int, threads: int, warm_up: int = WARM_UP) -> list[dict[str, Any]]:
     """A row a model: size of the file, and of each runtime median, 99 % and how many times as fast as REFERENCE."""
     calls = {(m, r): load(path, threads) for m, path in models.items() for r, load in RUNTIMES.items()}
-    times = measure(calls, rounds, warm_up, in_a_row)
+    times = measure(calls, rounds, warm_up)
     rows = []
     for name, path in models.items():
         row: dict[str, Any] = {"model": name, "megabytes": path.stat().st_size / 1e6}
@@ -155,7 +147,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("files", nargs="*", type=Path, help="further model files")
     parser.add_argument("--rounds", type=int, default=300)
-    parser.add_argument("--in-a-row", type=int, default=1, help="calls a turn")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     options = parser.parse_args()
@@ -164,14 +155,13 @@ def main() -> None:
         models = {name: Path(folder) / f"{number}.onnx" for number, name in enumerate(NETWORKS)}
         for name, path in models.items():
             write_network(path, **NETWORKS[name])
-        rows = table(models | files, options.rounds, options.threads, in_a_row=options.in_a_row)
+        rows = table(models | files, options.rounds, options.threads)
     load = os.getloadavg()[0]
-    settings = {"threads": options.threads, "rounds": options.rounds, "in_a_row": options.in_a_row, "load": load}
     if options.json:
-        print(json.dumps({**settings, "rows": rows}, indent=1))
+        print(json.dumps({"threads": options.threads, "rounds": options.rounds, "load": load, "rows": rows}, indent=1))
         return
     print(markdown(rows))
-    print(f"\n{', '.join(f'{name} {value}' for name, value in settings.items())}; fp32 but for what a file says")
+    print(f"\n{options.rounds} rounds, {options.threads} threads, fp32 but for what a file says; load {load:.1f}")
     if "OpenVINO" not in RUNTIMES:
         print("OpenVINO is not installed: pip install openvino")
 

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,20 +36,6 @@ def test_calls_take_turns(benchmark):
     # A sleep lasts no less than asked for; how much longer is the machine's affair.
     assert times["slow"].min() >= 20
     assert times["fast"].min() >= 1
-
-
-def test_of_several_in_a_row_the_first_does_not_count(benchmark):
-    made = []
-
-    def call(name):
-        made.append(name)
-        time.sleep(0.02 if len(made) % 3 == 1 else 0)
-
-    calls = {name: partial(call, name) for name in "ab"}
-    times = benchmark.measure(calls, rounds=4, warm_up=1, in_a_row=3)
-    assert [len(set(made[n : n + 3])) for n in range(0, 30, 3)] == [1] * 10
-    assert {len(values) for values in times.values()} == {8}
-    assert max(np.median(values) for values in times.values()) < 20  # the slow one is each row's first
 
 
 @pytest.mark.slow
