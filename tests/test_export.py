@@ -160,22 +160,15 @@ def test_each_corner_is_looked_at_on_request(tmp_path, folder):
 
 
 @pytest.mark.slow
-def test_a_model_that_does_not_look_at_corners_says_so(folder, tmp_path):
+def test_a_model_that_cannot_search_or_does_not_look_at_corners_says_so(folder, tmp_path):
     export(folder / "best.pt", tmp_path / "model.onnx")
-    detector = sf.KeypointDetector(tmp_path / "model.onnx")
-    assert not detector.sharpens
-    with pytest.raises(sf.InputError, match="does not look at corners"):
-        known = sf.GaussianKeypoints.from_sigma(np.eye(4, 2), 1.0)
-        detector.sharpened(np.zeros((SIZE, SIZE, 3), np.uint8), known)
-
-
-@pytest.mark.slow
-def test_a_model_that_cannot_search_says_so(folder, tmp_path):
-    export(folder / "best.pt", tmp_path / "model.onnx")
-    detector = sf.KeypointDetector(tmp_path / "model.onnx")
+    detector, image = sf.KeypointDetector(tmp_path / "model.onnx"), np.zeros((SIZE, SIZE, 3), np.uint8)
     assert not detector.searches
     with pytest.raises(sf.InputError, match="does not say where runways are"):
-        detector.spots(np.zeros((SIZE, SIZE, 3), np.uint8), [sf.PixelWindow(0, 0, SIZE, SIZE, SIZE, SIZE)])
+        detector.spots(image, [sf.PixelWindow(0, 0, SIZE, SIZE, SIZE, SIZE)])
+    assert not detector.sharpens
+    with pytest.raises(sf.InputError, match="does not look at corners"):
+        detector.sharpened(image, sf.GaussianKeypoints.from_sigma(np.eye(4, 2), 1.0))
 
 
 @pytest.mark.slow

@@ -59,3 +59,17 @@ def correlated(r):
 def test_an_uncertainty_that_cannot_be_is_refused(build, message):
     with pytest.raises(sf.InputError, match=message):
         build()
+
+
+def test_what_is_replaced_is_independent_of_what_stays():
+    root = np.random.default_rng(0).normal(size=(2, 8, 8))
+    one, other = (
+        sf.GaussianKeypoints(np.full((4, 2), float(n)), r @ r.T + np.eye(8)) for n, r in enumerate(root)
+    )  # fmt: skip
+    both = one.replaced([1, 3], other)
+    np.testing.assert_array_equal(both.mean_px[:, 0], [0, 1, 0, 1])
+    new, old = [2, 3, 6, 7], [0, 1, 4, 5]
+    np.testing.assert_array_equal(both.cov_px[np.ix_(new, new)], other.cov_px[np.ix_(new, new)])
+    np.testing.assert_array_equal(both.cov_px[np.ix_(old, old)], one.cov_px[np.ix_(old, old)])
+    assert not both.cov_px[np.ix_(new, old)].any()
+    np.testing.assert_array_equal(one.replaced([], other).cov_px, one.cov_px)

@@ -158,6 +158,7 @@ class KeypointDetector:
         self.calibration = self.info.calibration if calibrated else None
         scale = self.calibration.sigma_scale if self.calibration else ()
         self._gain = np.outer(scale, scale) if scale else None  # of the covariance: D C D, D diagonal
+        self._outputs = {output.name for output in self._session.get_outputs()}
 
     def detect(self, image: Image, window: PixelWindow) -> GaussianKeypoints:
         """The keypoints of `look`."""
@@ -179,7 +180,7 @@ class KeypointDetector:
     @property
     def searches(self) -> bool:
         """Whether the model says where runways are (`spots`)."""
-        return any(output.name == WHERE for output in self._session.get_outputs())
+        return WHERE in self._outputs
 
     def spots(self, image: Image, windows: Sequence[PixelWindow]) -> list[Spot]:
         """Where in several windows of an image there may be runways, of any size; likeliest first. One call of the
@@ -199,7 +200,7 @@ class KeypointDetector:
     @property
     def sharpens(self) -> bool:
         """Whether the model looks at each corner by itself (`sharpened`)."""
-        return any(output.name == CORNER_OUTPUTS[0] for output in self._session.get_outputs())
+        return CORNER_OUTPUTS[0] in self._outputs
 
     def sharpened(self, image: Image, keypoints: GaussianKeypoints, looks: int = CORNER_LOOKS) -> GaussianKeypoints:
         """Keypoints with their corners looked at again, each in a patch of its own at the image's resolution
@@ -213,15 +214,19 @@ class KeypointDetector:
             raise InputError("the model does not look at corners by themselves: train it with learn = corners")
         info, known = self.info, keypoints
         pixels = np.empty((1, 4, 3, PATCH_PX, PATCH_PX), np.float32)
+        nothing = np.empty((0, 3, info.size, info.size), np.float32)
         for _ in range(looks):
             maps = corner_patches(known.mean_px[:4], known.sigma_px[:4])
             for corner, image_from_patch in enumerate(maps):
                 patch = warp_image(image, image_from_patch, (PATCH_PX, PATCH_PX))
                 normalise(patch, info.mean, info.std, out=pixels[0, corner])
-            nothing = np.empty((0, 3, info.size, info.size), np.float32)
             inputs = {"image": nothing, PATCHES: pixels, SHARPEN: np.array(True)}
             (mean,), (cov,), (visible,) = self._answers(CORNER_OUTPUTS, inputs)
-            known = _put_back(known, maps, mean, cov, visible, self._gain)
+            # From the patches to the image.
+            axes, blocks = maps[:, :, :2], cov.astype(np.float64).reshape(4, 2, 4, 2)
+            mean = np.einsum("kij,kj->ki", axes, mean.astype(np.float64)) + maps[:, :, 2]
+            cov = self._mended(np.einsum("kij,kjml,mnl->kimn", axes, blocks, axes).reshape(8, 8))
+            known = known.replaced(np.flatnonzero(visible >= VISIBLE), GaussianKeypoints(mean, cov))
         return known
 
     def _run(self, image: Image, windows: Sequence[PixelWindow], outputs: Sequence[str]) -> list[Any]:
@@ -251,32 +256,14 @@ class KeypointDetector:
         probabilities = np.append(visible, present).astype(np.float64)
         if not ((probabilities >= 0) & (probabilities <= 1)).all():
             raise InputError(f"the model answers {probabilities.tolist()} where probabilities are expected")
-        cov = cov.astype(np.float64)
-        cov = (cov + cov.T) / 2  # equal but for the rounding of float32
-        if self._gain is not None:
-            cov *= self._gain
+        cov = self._mended(cov.astype(np.float64))
         keypoints = GaussianKeypoints(window.inverse(mean), window.inverse_cov(cov))
         return Look(window, keypoints, frozen(probabilities[:-1]), float(present))
 
-
-def _put_back(
-    known: GaussianKeypoints, maps: Array, mean: Any, cov: Any, visible: Any, gain: Array | None
-) -> GaussianKeypoints:
-    """Keypoints with the corners that are visible in their patches: what the network says of those, in the image."""
-    seen = np.flatnonzero(visible >= VISIBLE)
-    new_mean, new_cov = known.mean_px.copy(), known.cov_px.copy()
-    axes = maps[:, :, :2]
-    new_mean[seen] = ((axes @ mean[:, :, None].astype(np.float64))[..., 0] + maps[:, :, 2])[seen]
-    turn = np.zeros((8, 8))
-    for corner in range(4):
-        turn[2 * corner : 2 * corner + 2, 2 * corner : 2 * corner + 2] = axes[corner]
-    rows = np.repeat(2 * seen, 2) + np.tile([0, 1], len(seen))
-    new_cov[rows], new_cov[:, rows] = 0.0, 0.0
-    spread = turn @ cov.astype(np.float64) @ turn.T
-    if gain is not None:
-        spread *= gain[:8, :8]
-    new_cov[np.ix_(rows, rows)] = ((spread + spread.T) / 2)[np.ix_(rows, rows)]
-    return GaussianKeypoints(new_mean, new_cov)
+    def _mended(self, cov: Array) -> Array:
+        """The network's covariance of its first keypoints (n, n), symmetric, as the calibration says."""
+        cov = (cov + cov.T) / 2  # equal but for the rounding of float32
+        return cov if self._gain is None else cov * self._gain[: len(cov), : len(cov)]
 
 
 def _spots(window: PixelWindow, share: Any, side: Any) -> list[Spot]:

@@ -97,6 +97,16 @@ class GaussianKeypoints:
         rows = np.repeat(keep, 2)
         return self if keep.all() else GaussianKeypoints(self.mean_px[keep], self.cov_px[np.ix_(rows, rows)])
 
+    def replaced(self, chosen: ArrayLike, other: GaussianKeypoints) -> GaussianKeypoints:
+        """With the keypoints whose numbers are `chosen` (n,) as `other` has them, independent of those that stay."""
+        keypoints = np.asarray(chosen, int)
+        rows = (2 * keypoints[:, None] + [0, 1]).ravel()
+        mean, cov = self.mean_px.copy(), self.cov_px.copy()
+        mean[keypoints] = other.mean_px[keypoints]
+        cov[rows], cov[:, rows] = 0.0, 0.0
+        cov[np.ix_(rows, rows)] = other.cov_px[np.ix_(rows, rows)]
+        return GaussianKeypoints(mean, cov)
+
     def block(self, k: int) -> Array:
         """Covariance (2, 2) of keypoint k, for its ellipse."""
         return self.cov_px[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shortfinal.crops import box_around, centre_crop
-from shortfinal.detector import Image, KeypointDetector, Look, Spot, check_image, crop_image
+from shortfinal.detector import VISIBLE, Image, KeypointDetector, Look, Spot, check_image, crop_image
 from shortfinal.errors import InputError
 from shortfinal.geometry import Camera, PixelWindow, Pose, as_array, project
 from shortfinal.integrity import FALSE_ALARM_RATE, Decision, IntegrityVerdict, check_integrity, check_rate
@@ -35,7 +35,7 @@ SPOT_MARGIN = 2.2  # of the first crop where a search found something: its place
 CERTAIN, LIKELY = (0.999, 0.9, 0.09), (0.9, 0.5, 0.18)
 FOLLOWED = 6  # spots of a frame, at most, that are looked at closely
 LOOKS = 3  # crops at most, for a frame
-PRESENT = 0.5  # probability of a runway below which there is none, and of a corner below which it is not seen
+PRESENT = 0.5  # probability of a runway below which there is none
 ENDS = (slice(0, 2), slice(2, 4))  # the keypoints of the near end and of the far one
 END_MARGIN = 1.6  # of the crop around one end: its side over the end's width, beside the first look's doubt
 SHARPER = 1.5  # an end is looked at again where that enlarges it by so much,
@@ -373,7 +373,7 @@ class Sight:
     @property
     def seen(self) -> NDArray[np.bool_]:
         """Which keypoints take part (K,): the corners, and of the further ones those that are in view."""
-        return np.asarray((self.look.visible >= PRESENT) | (np.arange(len(self.look.visible)) < 4))
+        return np.asarray((self.look.visible >= VISIBLE) | (np.arange(len(self.look.visible)) < 4))
 
 
 def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float | None = None) -> Sight:
@@ -392,7 +392,7 @@ def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float 
     for _ in range(LOOKS - 1):
         if _frames(look, own):
             break
-        wider = own if look.visible[:4].min() >= PRESENT else WIDE_MARGIN
+        wider = own if look.visible[:4].min() >= VISIBLE else WIDE_MARGIN
         look = detector.look(frame, centre_crop(box_around(look.keypoints.mean_px[:4]), wider, size))
     if look.present < PRESENT:
         return Sight(look, look.keypoints, f"no runway in view (its probability is {look.present:.2g})")
@@ -443,15 +443,12 @@ def _sharpened(
     windows = {end: w for end, w in windows.items() if w.scale[0] > SHARPER * look.window.scale[0]}
     if not windows:
         return known, ()
-    mean, cov = known.mean_px.copy(), known.cov_px.copy()
     for end, again in zip(windows, detector.look_all(frame, list(windows.values())), strict=True):
-        corners, rows = ENDS[end], slice(2 * ENDS[end].start, 2 * ENDS[end].stop)
-        if again.visible[corners].min() < PRESENT or not _holds(again.window, again.keypoints.mean_px[corners]):
+        corners = ENDS[end]
+        if again.visible[corners].min() < VISIBLE or not _holds(again.window, again.keypoints.mean_px[corners]):
             continue  # the first look stands
-        mean[corners] = again.keypoints.mean_px[corners]
-        cov[rows], cov[:, rows] = 0.0, 0.0
-        cov[rows, rows] = again.keypoints.cov_px[rows, rows]
-    return GaussianKeypoints(mean, cov), tuple(windows.values())
+        known = known.replaced(range(corners.start, corners.stop), again.keypoints)
+    return known, tuple(windows.values())
 
 
 def _cut_off(keypoints: GaussianKeypoints, width: int, height: int) -> str:
@@ -485,7 +482,7 @@ def _bounds(window: PixelWindow) -> list[float]:
 
 def _frames(look: Look, margin: float) -> bool:
     """Whether the crop has all corners inside, with half the intended border, and the runway not much too small."""
-    if look.visible[:4].min() < PRESENT:
+    if look.visible[:4].min() < VISIBLE:
         return False
     inside = look.window.apply(look.keypoints.mean_px[:4]) / (look.window.out_width - 1)
     border = (1 - 1 / margin) / 4

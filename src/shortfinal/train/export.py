@@ -18,7 +18,7 @@ import onnx_ir
 import onnxruntime
 import torch
 from numpy.typing import NDArray
-from onnx import ModelProto, NodeProto, TensorProto, compose, helper, numpy_helper
+from onnx import GraphProto, ModelProto, NodeProto, TensorProto, compose, helper, numpy_helper
 from torch import Tensor, nn
 
 from shortfinal.calibrate import framed
@@ -181,10 +181,15 @@ def _info(state: dict[str, Any], precision: Precision) -> ModelInfo:
 
 def to_onnx(network: Network, size: int) -> ModelProto:
     """The network in float32, for any number of pictures; its nodes still say of which module they are."""
-    batch = torch.export.Dim("batch", min=1, max=4096)
+    return _traced(network, torch.zeros(2, 3, size, size), "image", "batch", network.outputs)
+
+
+def _traced(network: nn.Module, pictures: Tensor, name: str, many: str, outputs: Sequence[str]) -> ModelProto:
+    """A network of one input, called `name` as its forward calls it, for any number of pictures, called `many`."""
+    number = torch.export.Dim(many, min=1, max=4096)
     program = torch.onnx.export(
-        network, (torch.zeros(2, 3, size, size),), input_names=["image"], output_names=list(network.outputs),
-        dynamo=True, dynamic_shapes={"image": {0: batch}}, verbose=False,
+        network, (pictures,), input_names=[name], output_names=list(outputs), dynamo=True,
+        dynamic_shapes={name: {0: number}}, verbose=False,
     )  # fmt: skip
     assert program is not None
     return program.model_proto
@@ -206,16 +211,16 @@ def _on_request(model: ModelProto) -> ModelProto:
     kept = [node for node in graph.node if needed & set(node.output)]
     del graph.node[:]
     graph.node.extend(kept)
-    graph.node.append(_asked(SEARCH, others, {WHERE: (1, 2, 0, 0)}))
+    _ask_for(graph, SEARCH, others, {WHERE: (1, 2, 0, 0)})
     declared = next(output for output in graph.output if output.name == WHERE)
     declared.CopyFrom(helper.make_tensor_value_info(WHERE, TensorProto.FLOAT, ["batch", 2, "rows", "columns"]))
-    graph.input.append(helper.make_tensor_value_info(SEARCH, TensorProto.BOOL, []))
-    graph.initializer.append(numpy_helper.from_array(np.array(False), SEARCH))
     return conditional
 
 
-def _asked(condition: str, nodes: Sequence[NodeProto], outputs: Mapping[str, Sequence[int]]) -> NodeProto:
-    """The node that makes `outputs` by `nodes` where the input `condition` is true, and else nothing, of that shape."""
+def _ask_for(
+    graph: GraphProto, condition: str, nodes: Sequence[NodeProto], outputs: Mapping[str, Sequence[int]]
+) -> None:
+    """Make `outputs` by `nodes` where the `condition`, an optional input, is true, and else nothing, of that shape."""
     for node in nodes:
         for names in (node.input, node.output):
             names[:] = [f"{name}.asked" if name in outputs else name for name in names]
@@ -223,10 +228,14 @@ def _asked(condition: str, nodes: Sequence[NodeProto], outputs: Mapping[str, Seq
     nothing = [numpy_helper.from_array(np.zeros(size, np.float32), f"{n}.unasked") for n, size in outputs.items()]
     constants = [helper.make_node("Constant", [], [tensor.name], value=tensor) for tensor in nothing]
     untold = [helper.make_tensor_value_info(tensor.name, TensorProto.FLOAT, None) for tensor in nothing]
-    return helper.make_node(
-        "If", [condition], list(outputs), then_branch=helper.make_graph(nodes, f"{condition} asked", [], told),
-        else_branch=helper.make_graph(constants, f"{condition} not asked", [], untold),
+    graph.node.append(
+        helper.make_node(
+            "If", [condition], list(outputs), then_branch=helper.make_graph(nodes, f"{condition} asked", [], told),
+            else_branch=helper.make_graph(constants, f"{condition} not asked", [], untold),
+        )
     )  # fmt: skip
+    graph.input.append(helper.make_tensor_value_info(condition, TensorProto.BOOL, []))
+    graph.initializer.append(numpy_helper.from_array(np.array(False), condition))
 
 
 def _with_corners(model: ModelProto, corners: Corners) -> ModelProto:
@@ -236,14 +245,8 @@ def _with_corners(model: ModelProto, corners: Corners) -> ModelProto:
     ONNX Runtime and torch differ by more than the limits.
     """
     network = _CornerNetwork(corners).eval()
-    looks = torch.export.Dim("looks", min=1, max=4096)
     patches = random_pictures(PATCH_PX, 4 * _BATCH).reshape(-1, 4, 3, PATCH_PX, PATCH_PX)
-    program = torch.onnx.export(
-        network, (torch.from_numpy(patches[:2]),), input_names=[PATCHES], output_names=list(CORNER_OUTPUTS),
-        dynamo=True, dynamic_shapes={PATCHES: {0: looks}}, verbose=False,
-    )  # fmt: skip
-    assert program is not None
-    beside = program.model_proto
+    beside = _traced(network, torch.from_numpy(patches[:2]), PATCHES, "looks", CORNER_OUTPUTS)
     difference = compare(beside, patches, answers_of(network, patches))
     if not difference.within(LIMITS["fp32"]):
         raise JobError(f"the part that looks at corners differs from torch by {difference}; not written")
@@ -256,11 +259,9 @@ def _with_corners(model: ModelProto, corners: Corners) -> ModelProto:
     graph.initializer.extend(beside.graph.initializer)
     graph.input.extend(beside.graph.input)
     graph.output.extend(beside.graph.output)
-    graph.input.append(helper.make_tensor_value_info(SHARPEN, TensorProto.BOOL, []))
     graph.initializer.append(numpy_helper.from_array(np.zeros((1, *patches.shape[1:]), np.float32), PATCHES))
-    graph.initializer.append(numpy_helper.from_array(np.array(False), SHARPEN))
     shapes = dict(zip(CORNER_OUTPUTS, ((0, 4, 2), (0, 8, 8), (0, 4)), strict=True))
-    graph.node.append(_asked(SHARPEN, list(beside.graph.node), shapes))
+    _ask_for(graph, SHARPEN, list(beside.graph.node), shapes)
     return joined
 
 

@@ -344,7 +344,7 @@ class Run:
             getattr(self, part).load_state_dict(state[part])
         self.fabric.strategy.precision.load_state_dict(state.get("precision", {}))
         self.step, self.history = state["step"], state["history"]
-        self.figures = _corner_figures(state)
+        self.figures = _last_figures(state)
         return True
 
     def begin(self, pictures: Callable[[], Tensor]) -> None:
@@ -357,11 +357,11 @@ class Run:
             differ = [name for name in ("backbone", "head", "features", "mean", "std") if was[name] != now[name]]
             differ += [k for k, v in weights.items() if k not in mine or mine[k].shape != v.shape]
             # One that had no correlations, or did not say where, may become one that does.
-            differ += [k for k in mine if k not in weights and not k.startswith(("correlation.", *_prefixes(PARTS)))]
+            differ += [k for k in mine if k not in weights and k.partition(".")[0] not in ("correlation", *PARTS)]
             if differ:
                 raise InputError(f"{recipe.start}: of another network ({differ[0]} differs)")
             self.net.load_state_dict(weights, strict=False)
-            self.figures = _corner_figures(state)
+            self.figures = _last_figures(state)
         elif recipe.weights not in ("", "timm"):
             if recipe.weights.endswith(".npz") and (recipe.mean, recipe.std) != (FOLDED_MEAN, FOLDED_STD):
                 raise InputError(f"{recipe.weights}: needs mean = {list(FOLDED_MEAN)} and std = {list(FOLDED_STD)}")
@@ -434,10 +434,6 @@ def network_of(
     )  # fmt: skip
 
 
-def _prefixes(parts: Iterable[str]) -> tuple[str, ...]:
-    return tuple(f"{name}." for name in parts)
-
-
 def _network(recipe: Recipe, earlier: Mapping[str, Tensor] | None, pretrained: bool) -> KeypointNet:
     """The recipe's network, once tried. Raises InputError for a backbone that has no weights, or not this size."""
     try:
@@ -507,8 +503,8 @@ def network_weights(state: dict[str, Any]) -> dict[str, Tensor]:
     return {k.removeprefix("module."): v for k, v in state["average"].items() if k.startswith("module.")}
 
 
-def _corner_figures(state: dict[str, Any]) -> dict[str, float]:
-    """What a checkpoint says of its corners."""
+def _last_figures(state: dict[str, Any]) -> dict[str, float]:
+    """What a checkpoint says of its network."""
     return {k: v for k, v in state["history"][-1].items() if k not in ("step", "loss")}
 
 

@@ -64,6 +64,8 @@ class KeypointNet(nn.Module):
     a fused map.
     """
 
+    linked: Tensor
+
     def __init__(
         self,
         backbone: str = "mobilenetv4_conv_small",
@@ -130,16 +132,19 @@ class KeypointNet(nn.Module):
         sigma = (spread[..., :2].exp() + MIN_SIGMA_PX**2).sqrt()
         where = None if self.where is None or fused is None else self.where(fused)
         return Prediction(
-            mean * size - 0.5, sigma, self._factor(told), spread[..., 2], self.present(whole)[:, 0], looked, where
+            mean * size - 0.5,
+            sigma,
+            _factor(self.correlation, self.linked, told),
+            spread[..., 2],
+            self.present(whole)[:, 0],
+            looked,
+            where,
         )
 
     @property
     def means(self) -> list[nn.Module]:
         """The parts that the means come from; the others say how sure they are, and whether there is a runway."""
         return [part for part in (self.backbone, self.neck, self.score, self.fc) if part is not None]
-
-    def _factor(self, told: Tensor) -> Tensor | None:
-        return None if self.correlation is None else _factor(self.correlation(told.flatten(1)) @ self.linked)
 
 
 class Corners(nn.Module):
@@ -149,6 +154,8 @@ class Corners(nn.Module):
     All corners look alike there, so that one small network knows them all. Together they give the covariance.
     `visible`: the corner is in its patch; `present`: the likeliest of them.
     """
+
+    linked: Tensor
 
     def __init__(self, covariance: Covariance, width: int = 32) -> None:
         super().__init__()
@@ -197,7 +204,7 @@ class Corners(nn.Module):
         told = torch.cat([local[:, 0], deep.mean(dim=(2, 3)), variance[:, 0].clamp_min(1e-6).log()], dim=-1)
         told = told.unflatten(0, (-1, 4))
         spread = self.spread(told)
-        factor = None if self.correlation is None else _factor(self.correlation(told.flatten(1)) @ self.linked)
+        factor = _factor(self.correlation, self.linked, told)
         visible = spread[..., 2]
         return Prediction(
             mean.unflatten(0, (-1, 4))[:, :, 0] * size - 0.5, (spread[..., :2].exp() + MIN_SIGMA_PX**2).sqrt(), factor,
@@ -205,10 +212,13 @@ class Corners(nn.Module):
         )  # fmt: skip
 
 
-def _factor(below: Tensor) -> Tensor:
-    """A correlation's Cholesky factor (B, n, n) from what is below its diagonal (B, n²): a unit lower triangle, its
-    rows scaled to length one.
+def _factor(correlation: nn.Module | None, linked: Tensor, told: Tensor) -> Tensor | None:
+    """The correlation's Cholesky factor (B, n, n): a unit lower triangle, its rows scaled to length one; `linked` (n²
+    wide) are the entries that the layers fill from what is `told` of each keypoint (B, K, C).
     """
+    if correlation is None:
+        return None
+    below = correlation(told.flatten(1)) @ linked
     n = math.isqrt(below.shape[1])
     lower = below.unflatten(1, (n, n)) + torch.eye(n, device=below.device)
     factor: Tensor = lower / lower.norm(dim=2, keepdim=True)
