@@ -31,6 +31,11 @@ def checkpoint(path, keypoints=sf.CORNER_NAMES, sharp=300.0, **network):
         for name, weight in net.named_parameters():
             if name.startswith(("score", "spread", "correlation", "present", "fc")):
                 weight *= sharp if name == "score.weight" else 3.0
+        for name, value in net.state_dict().items():  # no two are alike after training
+            if name.endswith(("bias", "running_mean")):
+                value += 0.01 * torch.randn_like(value)
+            elif value.is_floating_point() and value.dim() == 1:
+                value *= 1 + 0.02 * torch.randn_like(value)
     average = AveragedModel(net)
     parts = {"net": net.state_dict(), "average": average.state_dict(), "optimizer": {}, "schedule": {}}
     history = [{"median_px": 9.0}, {"step": 4.0, "median_px": 1.5, "far_median_px": float("nan")}]
@@ -52,6 +57,15 @@ def told(path, pictures):
     with torch.inference_mode():
         p = network.net(torch.from_numpy(pictures))
     return p.mean_px, p.cov_px, p.visible.sigmoid(), p.present.sigmoid(), p.sigma_px
+
+
+def alike(given, wanted):
+    """Covariances in units of their sigmas. float32: 1e-5 of the side, in pixels; a thousandth of a correlation."""
+    variance = np.diagonal(wanted[1], axis1=1, axis2=2)
+    unit = [1.0, np.sqrt(variance[:, :, None] * variance[:, None, :]), 1.0, 1.0]
+    for mine, true, one in zip(given, wanted, unit):
+        np.testing.assert_allclose(np.asarray(mine) / one, np.asarray(true) / one, rtol=1e-4,
+                                   atol=max(1e-5 * SIZE, 1e-3))  # fmt: skip
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -98,17 +112,15 @@ def test_the_file_answers_as_torch_for_any_number_of_pictures(tmp_path, network)
         *wanted, sigma = told(path, pictures)
         given = answers(tmp_path / "model.onnx", pictures)
         assert [a.shape[1:] for a in given] == [(k, 2), (2 * k, 2 * k), (k,), ()]
+        alike(given, wanted)
         variance = np.diagonal(given[1], axis1=1, axis2=2)
-        unit = [1.0, np.sqrt(variance[:, :, None] * variance[:, None, :]), 1.0, 1.0]
-        for mine, true, one in zip(given, wanted, unit):
-            # float32: 1e-5 of the side, in pixels; a thousandth of a correlation.
-            np.testing.assert_allclose(mine / one, true / one, rtol=1e-4, atol=max(1e-5 * SIZE, 1e-3))
         np.testing.assert_allclose(np.sqrt(variance), sigma.flatten(1), rtol=1e-4)
         correlation = given[1] / np.sqrt(variance[:, :, None] * variance[:, None, :])
         assert (np.abs(np.tril(correlation, -1)).max() > 0.1) == (info.covariance != "diagonal")
     detector = sf.KeypointDetector(tmp_path / "model.onnx")
     assert detector.info == info
     detector.detect(np.zeros((SIZE, SIZE, 3), np.uint8), sf.PixelWindow(0, 0, SIZE, SIZE, SIZE, SIZE))
+    alike(told(tmp_path / "model.onnx", pictures)[:-1], wanted)  # the file read as a checkpoint
 
 
 @pytest.mark.slow
@@ -155,8 +167,10 @@ def test_each_corner_is_looked_at_on_request(tmp_path, folder):
         np.testing.assert_allclose(visible, wanted.visible.sigmoid(), atol=1e-4)
     pictures = random_pictures(SIZE, 2, seed=3)
     assert [part.size for part in session.run(names, {"image": pictures})] == [0, 0, 0]
-    for mine, true in zip(answers(tmp_path / "model.onnx", pictures), told(path, pictures)):
-        np.testing.assert_allclose(mine, true, rtol=1e-3, atol=1e-3)  # the whole picture's as ever
+    alike(answers(tmp_path / "model.onnx", pictures), told(path, pictures)[:-1])  # the whole picture's as ever
+    again, _ = load_network(tmp_path / "model.onnx")
+    with torch.inference_mode():
+        np.testing.assert_allclose(again.net(torch.from_numpy(patches)).mean_px, wanted.mean_px, atol=1e-3)
 
 
 @pytest.mark.slow
@@ -199,6 +213,8 @@ def test_half_the_digits_in_the_backbone_only(folder, tmp_path):
     assert 1e-5 < off.max() < 0.05
     assert not np.array_equal(mean, mean.astype(np.float16))  # coordinates are not rounded to it
     np.testing.assert_allclose(np.diagonal(cov, axis1=1, axis2=2), np.diagonal(true_cov, axis1=1, axis2=2), rtol=0.02)
+    with pytest.raises(sf.InputError, match=r"model\.onnx: a model in fp16; only one in fp32 can be trained on"):
+        load_network(tmp_path / "model.onnx")
 
 
 def test_int8_loses_no_more_than_it_may(folder, tmp_path):

@@ -26,7 +26,7 @@ def test_a_file_a_preset_and_changes_in_this_order(tmp_path):
 
 def test_the_presets_are_the_papers():
     """arXiv 2508.09732: 30 epochs, the loss as printed, deepest features only, no schedule; two optimisers."""
-    assert set(PRESETS) == {"default", "paper-resnet", "paper-efficientnet"}
+    assert set(PRESETS) == {"default", "finetune", "large", "paper-resnet", "paper-efficientnet"}
     resnet, efficientnet = (make_recipe(f"paper-{name}", DATA) for name in ("resnet", "efficientnet"))
     assert (efficientnet.optimizer, efficientnet.learning_rate) == ("rmsprop", 1e-4)
     for recipe in (resnet, efficientnet):
@@ -78,8 +78,8 @@ DAMAGE = [
     ({"keypoints": ["near-left"]}, "keypoints: near-left; expected near-left, near-right, far-right, far-left, then"),
     ({"keypoints": [*sf.CORNER_NAMES, "near-left"]}, "keypoints: near-left, near-right, far-right, far-left, near-l"),
     ({"likelihood": "beta", "covariance": "full"}, "likelihood: beta weighs coordinates one by one"),
-    ({"learn": "covariance"}, "learn: covariance needs start, a checkpoint"),
-    ({"learn": "where"}, "learn: where needs start, a checkpoint"),
+    ({"learn": "covariance"}, "learn: covariance needs start, a network"),
+    ({"learn": "where"}, "learn: where needs start, a network"),
     ({"first_look": "m.onnx"}, "first_look: only learn = corners begins from one"),
     ({"crop": "tile"}, "crop: 'tile'; expected one of framed, native"),
 ]
@@ -102,7 +102,7 @@ def test_damage_is_one_line_that_names_the_field(changes, message):
         (b"\xff\xfe\x00", "not a TOML file: "),
         (b"x = " + b"[" * 3000, "not a TOML file: "),
         (b"seed = 3", "data: missing; the folder, or folders, to train on"),
-        (b"preset = 'paper'\ndata = 'a'", "preset: 'paper'; expected one of default, paper-resnet, paper-efficientnet"),
+        (b"preset = 'paper'\ndata = 'a'", "preset: 'paper'; expected one of default, finetune, large, paper-"),
         (b"data = 'a'\n[network]\nwidth = 3", "network: no such field"),
         (b"data = 'a'\nwidth = 0", "width: 0; expected a whole number from 1 to 4096"),
     ],

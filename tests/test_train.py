@@ -25,7 +25,7 @@ torch = pytest.importorskip("torch")
 from shortfinal.train import fit  # noqa: E402
 from shortfinal.train.fit import Batch, Run, auroc, figures_of, load_checkpoint, network_weights, open_data, train  # noqa: E402
 from shortfinal.train.model import Prediction  # noqa: E402
-from shortfinal.train.recipe import Recipe, to_dict  # noqa: E402
+from shortfinal.train.recipe import Recipe, make_recipe, to_dict  # noqa: E402
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 FOLDED = DATA / "weights" / "tf2_mobilenet_v2_1.0_224_ptq_float32.npz"
@@ -441,6 +441,29 @@ def test_a_run_begins_where_another_ended(recipe, done, tmp_path):
         if name.endswith(("running_mean", "running_var", "num_batches_tracked")):
             continue  # they follow the pictures
         torch.testing.assert_close(now[name], weight)
+
+
+def test_a_run_begins_with_the_network_that_ships(recipe, scenes, tmp_path):
+    folders = {name: getattr(recipe, name) for name in ("data", "validation")}
+    second = make_recipe("finetune", {**folders, "out": str(tmp_path), "batch": 4, "steps": 1, "workers": 0})
+    run = Run(second, 12)
+    examples = read_dataset(scenes / "a")
+    pictures = torch.stack([fit._Held(examples, second)[n].image for n in range(4)])
+    run.begin(lambda: pictures)
+    whole, half = sf.PixelWindow(0, 0, 224, 224, 224, 224), pictures[0].permute(1, 2, 0) * 0.25 + 0.5
+    picture = (half * 255).round().to(torch.uint8).numpy()
+    look = sf.KeypointDetector(calibrated=False).look(picture, whole)
+    with torch.inference_mode():
+        prediction = run.average.eval()(pictures[:1])
+    # Settled batch norms change nothing but the rounding of float32; the picture is of whole grey levels.
+    np.testing.assert_allclose(prediction.mean_px[0], look.keypoints.mean_px, atol=0.02)
+    np.testing.assert_allclose(prediction.sigma_px[0], look.keypoints.sigma_px, rtol=0.01)
+    norms = [m for m in run.net.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+    assert all(float((m.running_var - 1).abs().max()) > 1e-3 for m in norms)  # of what they see, so that they may learn
+    train(second)
+    was, now = (network_weights(load_checkpoint(path)) for path in ("shipped", tmp_path / "last.pt"))
+    learned = {name.partition(".")[0] for name in was if not torch.equal(was[name], now[name])}
+    assert learned == {"backbone", "neck", "score", "spread", "correlation", "present"}  # the other parts stay
 
 
 @pytest.mark.parametrize(

@@ -384,7 +384,7 @@ def train(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the checkpoints.")] = None,
     preset: Annotated[
-        str, typer.Option(help="default, paper-resnet or paper-efficientnet; without a recipe.")
+        str, typer.Option(help="default, finetune, large, paper-resnet or paper-efficientnet; without a recipe.")
     ] = "default",
     change: Annotated[
         list[str] | None, typer.Option("--set", help="Any field of the recipe: --set steps=20000.")

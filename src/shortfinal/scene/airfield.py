@@ -110,7 +110,10 @@ def random_airfield(rng: np.random.Generator, runway: Runway | None, grass: Arra
         designator=designator,
         digits=_designators(designator, int(rng.choice([-1, 0, 0, 0, 1, 2]))),
         other=_other_runway(rng, length, width, side),
-        strips=_strips(rng, length, width, surface, side),
+        strips=_joined(
+            # Drawn apart: the rest of a seed's airfield stays what it was before there were any.
+            _beside(rng.spawn(1)[0], length, width, surface, stripe > 0), _strips(rng, length, width, surface, side)
+        ),
         extent=np.zeros(4),
         verge=np.array([u(0, 25) * (rng.random() < 0.6), u(1, 15), *verge]),
         grounds=np.array([u(60, 300), u(60, 500), *grass, u(0.5, 1.0)]),
@@ -265,7 +268,33 @@ def _strips(rng: np.random.Generator, length: float, width: float, surface: Arra
             rng.uniform(2, 3.5),
             _PLAIN,
         )
-    return np.array((strips + [[0.0] * 9] * _MOST_STRIPS)[:_MOST_STRIPS])
+    return np.array(strips).reshape(-1, 9)
+
+
+def _beside(rng: np.random.Generator, length: float, width: float, surface: Array, striped: bool) -> Array:
+    """Pavement right along the runway's edge: turn pads (Annex 14, 3.3) at its ends, and aprons.
+
+    Seen from afar its outer edge passes for the runway's. Of the runway's own colour only where a side stripe tells.
+    """
+    u, strips = rng.uniform, []
+    for end, inward in ((0.0, 1.0), (length, -1.0)):
+        for side in (-1.0, 1.0):
+            if rng.random() > 0.15:
+                continue
+            half, long = (u(5, 15), u(40, 110)) if rng.random() < 0.5 else (u(8, 60), u(60, 500))
+            begin = u(-0.3, 0.3) * half if rng.random() < 0.6 else u(-1.0, 1.0) * long
+            y = side * (width / 2 + half - 1.0)
+            tone = surface * u(0.94, 1.06) if striped and rng.random() < 0.6 else _other_colour(rng, surface)
+            kind = rng.choice([_PLAIN, _TAXIWAY])
+            strips.append(
+                [end + inward * begin, y, end + inward * (begin + long), y, half, *np.clip(tone, 0.04, 0.92), kind]
+            )
+    return np.array(strips).reshape(-1, 9)
+
+
+def _joined(*strips: Array) -> Array:
+    """So many of them as an airfield may have, the first before the last."""
+    return np.vstack([*strips, np.zeros((_MOST_STRIPS, 9))])[:_MOST_STRIPS]
 
 
 @cache

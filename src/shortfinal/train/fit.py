@@ -28,14 +28,23 @@ from shortfinal.crops import PATCH_PX, box_around, centre_crop, native_crop, sea
 from shortfinal.data.augment import augmented_crop, corner_looks, inside, within
 from shortfinal.data.dataset import Example, LabelledDataset, read_dataset
 from shortfinal.data.formats import split_by_airport
-from shortfinal.detector import KeypointDetector, crop_image, normalise
+from shortfinal.detector import KeypointDetector, crop_image, normalise, shipped_model
 from shortfinal.errors import InputError, JobError
 from shortfinal.files import csv_text, make_folder, write_whole
 from shortfinal.geometry import PixelWindow
 from shortfinal.train.loss import attention_loss, gaussian_nll, scope_loss, where_loss
 from shortfinal.train.model import KeypointNet, Prediction
 from shortfinal.train.recipe import Recipe, to_dict
-from shortfinal.train.weights import FOLDED_MEAN, FOLDED_STD, first_line, load_weights, reading
+from shortfinal.train.weights import (
+    FOLDED_MEAN,
+    FOLDED_STD,
+    first_line,
+    fold_back,
+    load_weights,
+    read_model,
+    reading,
+    settle_batch_norm,
+)
 
 PARTS = ("where", "corners")  # of a network that learns them last, all else as it is
 _RISE = 0.03  # share of the steps in which the learning rate rises
@@ -312,9 +321,11 @@ class Run:
     @property
     def kept(self) -> list[torch.nn.Module]:
         """The parts of the network that do not learn."""
+        parts = dict(self.net.named_children())
         if self.recipe.learn in PARTS:
-            return [part for name, part in self.net.named_children() if name != self.recipe.learn]
-        return self.net.means if self.recipe.learn == "covariance" else []
+            return [part for name, part in parts.items() if name != self.recipe.learn]
+        means = self.net.means if self.recipe.learn == "covariance" else []
+        return means + [parts[name] for name in PARTS if name in parts]
 
     @property
     def goal(self) -> str:
@@ -362,6 +373,8 @@ class Run:
                 raise InputError(f"{recipe.start}: of another network ({differ[0]} differs)")
             self.net.load_state_dict(weights, strict=False)
             self.figures = _last_figures(state)
+            if _is_model(recipe.start) and recipe.learn == "all":  # its batch norms say nothing of what they saw
+                settle_batch_norm(self.net, pictures().to(self.fabric.device))
         elif recipe.weights not in ("", "timm"):
             if recipe.weights.endswith(".npz") and (recipe.mean, recipe.std) != (FOLDED_MEAN, FOLDED_STD):
                 raise InputError(f"{recipe.weights}: needs mean = {list(FOLDED_MEAN)} and std = {list(FOLDED_STD)}")
@@ -482,7 +495,11 @@ def _averaging(decay: float) -> Callable[[Any, Any, Any], None]:
 
 
 def load_checkpoint(path: str | Path) -> dict[str, Any]:
-    """The content of a checkpoint. Raises InputError if it is missing or not one of ours."""
+    """The content of a checkpoint, or as much of it as a model file (.onnx) holds: the recipe of its network, its
+    weights and figures; "shipped" is the one in the package. Raises InputError if it is missing or not one of ours.
+    """
+    if _is_model(path):
+        return _content_of_model(shipped_model() if path == "shipped" else path)
     with reading(path, "checkpoint", "a checkpoint"):
         state = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(state, dict) or "recipe" not in state:
@@ -496,6 +513,25 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     if lacks or not state["history"]:
         raise InputError(f"{path}: not a complete checkpoint: lacks {', '.join(lacks) or 'history'}")
     return state
+
+
+def _is_model(path: str | Path) -> bool:
+    return path == "shipped" or Path(path).suffix == ".onnx"
+
+
+def _content_of_model(path: str | Path) -> dict[str, Any]:
+    info, tensors = read_model(path)
+    told = {name: getattr(info, name) for name in ("size", "mean", "std", "keypoints", "covariance", "margin")}
+    recipe = to_dict(Recipe(data=("",), backbone=info.backbone, **told, **_of_network(info.training)))
+    weights = fold_back(network_of(recipe, tensors), tensors, info.size, path)
+    average = {f"module.{name}": value for name, value in weights.items()}
+    steps = int(info.training.get("steps", 0))
+    return {"recipe": recipe, "average": average, "step": steps, "history": [{"step": steps, **info.figures}]}
+
+
+def _of_network(training: dict[str, Any]) -> dict[str, Any]:
+    """Those fields of a recipe that a model file notes of its training and the network needs."""
+    return {name: training[name] for name in ("head", "features", "width") if name in training}
 
 
 def network_weights(state: dict[str, Any]) -> dict[str, Tensor]:

@@ -161,7 +161,7 @@ class Corners(nn.Module):
         super().__init__()
         deep = 2 * width
         self.shallow = nn.Sequential(_convolution(3, width // 2), _convolution(width // 2, width, 4, 2))
-        self.end = nn.Embedding(2, deep)  # the near one, the far one
+        self.end = nn.Parameter(torch.randn(1, 2, 1, deep, 1, 1))  # of the near end's two, of the far one's
         self.down = _convolution(width, deep, 4, 2)
         self.deep = nn.ModuleList([
             nn.Sequential(_convolution(deep, deep), nn.Conv2d(deep, deep, 3, padding=1, bias=False),
@@ -186,9 +186,7 @@ class Corners(nn.Module):
         level = image.mean(dim=(1, 2, 3), keepdim=True)
         contrast = (image - level).square().mean(dim=(1, 2, 3), keepdim=True).add(_DIM**2).sqrt()
         shallow = self.shallow(((image - level) / contrast).contiguous(memory_format=torch.channels_last))
-        end = torch.arange(4, device=image.device).div(2, rounding_mode="floor")
-        which = self.end(end).repeat(patches.shape[0], 1)  # not len(): the exporter would take it for fixed
-        deep = self.down(shallow) + which[:, :, None, None]
+        deep = (self.down(shallow).unflatten(0, (-1, 2, 2)) + self.end).flatten(0, 2)
         for layers in self.deep:
             deep = functional.relu(deep + layers(deep))
         up = functional.interpolate(self.lateral(deep), scale_factor=2.0, mode="bilinear", align_corners=False)
@@ -202,9 +200,8 @@ class Corners(nn.Module):
         mean, variance = soft_argmax(weight, *fused.shape[-2:])
         local = weight @ fused.flatten(2).transpose(1, 2)
         told = torch.cat([local[:, 0], deep.mean(dim=(2, 3)), variance[:, 0].clamp_min(1e-6).log()], dim=-1)
-        told = told.unflatten(0, (-1, 4))
-        spread = self.spread(told)
-        factor = _factor(self.correlation, self.linked, told)
+        spread = self.spread(told).unflatten(0, (-1, 4))
+        factor = _factor(self.correlation, self.linked, told.unflatten(0, (-1, 4)))
         visible = spread[..., 2]
         return Prediction(
             mean.unflatten(0, (-1, 4))[:, :, 0] * size - 0.5, (spread[..., :2].exp() + MIN_SIGMA_PX**2).sqrt(), factor,

@@ -48,7 +48,7 @@ class Recipe:
     margin: float = 1.4  # of the framed crop in evaluation; training draws its own (crops.random_margin)
     weather: bool = True  # augment: another camera in other weather
     # loss
-    start: str = ""  # a checkpoint whose network to begin from
+    start: str = ""  # a checkpoint, or a model file in fp32 ("shipped": the package's), whose network to begin from
     # "covariance": backbone and means stay as they are, on pictures they were not trained on; "where": all but the
     # search's part, which a network that has none gets; "corners": all but the part that looks at each corner.
     learn: Learn = "all"
@@ -89,7 +89,7 @@ class Recipe:
         if self.likelihood == "beta" and self.covariance != "diagonal":
             raise InputError(f"likelihood: beta weighs coordinates one by one; covariance {self.covariance} has more")
         if self.learn != "all" and not self.start:
-            raise InputError(f"learn: {self.learn} needs start, a checkpoint whose other parts are kept")
+            raise InputError(f"learn: {self.learn} needs start, a network whose other parts are kept")
         if self.first_look and self.learn != "corners":
             raise InputError("first_look: only learn = corners begins from one")
 
@@ -107,6 +107,9 @@ _PAPER: dict[str, Any] = {
 }  # fmt: skip
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
+    # On pictures of one's own, from the network that ships; or one several times as large, from nothing.
+    "finetune": {"start": "shipped", "covariance": "full", "learning_rate": 3e-4, "steps": 2000, "warm_up": 0.0},
+    "large": {"backbone": "mobilenetv4_conv_medium", "width": 96, "covariance": "full", "steps": 60000},
     "paper-resnet": {**_PAPER, "backbone": "resnet18", "optimizer": "adam", "learning_rate": 5e-4},
     "paper-efficientnet": {**_PAPER, "backbone": "efficientnet_b5", "optimizer": "rmsprop", "learning_rate": 1e-4},
 }

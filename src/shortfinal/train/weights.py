@@ -1,4 +1,4 @@
-"""Pretrained backbones from a local file."""
+"""Weights from a file: pretrained backbones, and the networks in model files."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
+from onnx import numpy_helper
 from torch import Tensor, nn
 
+from shortfinal.crops import PATCH_PX
+from shortfinal.detector import KeypointDetector, ModelInfo
 from shortfinal.errors import InputError
 
 FOLDED_MEAN = FOLDED_STD = (0.5, 0.5, 0.5)  # of RGB / 255, that `load_folded_mobilenet`'s file was trained with
@@ -124,6 +128,68 @@ def load_folded_mobilenet(model: nn.Module, path: str | Path) -> None:
             norm.running_var.fill_(1.0)
             norm.weight.fill_((1.0 + norm.eps) ** 0.5)
             norm.bias.copy_(torch.from_numpy(bias))
+
+
+def read_model(path: str | Path) -> tuple[ModelInfo, dict[str, Tensor]]:
+    """What a model file says of itself, and its tensors by their names in `KeypointNet`.
+
+    The exporter folds most batch norms into the convolutions before them, and calls what they add "<weight>_bias":
+    `fold_back` turns these into batch norms again. Raises InputError for a file that is no model of ours, or whose
+    weights are not in fp32.
+    """
+    info = KeypointDetector(path).info
+    if info.precision != "fp32":
+        raise InputError(f"{path}: a model in {info.precision}; only one in fp32 can be trained on")
+    named: dict[str, Tensor] = {}
+    for tensor in onnx.load(path).graph.initializer:
+        name = tensor.name.removeprefix("net.")
+        if "." in name:
+            named[name.removeprefix("corners.") if name.startswith("corners.corners.") else name] = torch.from_numpy(
+                numpy_helper.to_array(tensor).copy()
+            )
+    return info, named
+
+
+def fold_back(net: Any, tensors: dict[str, Tensor], size: int, source: str | Path) -> dict[str, Tensor]:
+    """The state of a `KeypointNet` of inputs (B, 3, S, S) from `read_model`'s tensors: a batch norm that was folded
+    into the convolution before it adds what that added, and does no more. Raises InputError if one is lacking.
+    """
+    state, names = dict(net.state_dict()), {id(module): name for name, module in net.named_modules()}
+    came: dict[int, tuple[str, Tensor]] = {}  # an output: whose it is; held, or its id would be another's
+
+    def passed(layer: nn.Module, inputs: Any, output: Tensor) -> None:
+        came[id(output)] = names[id(layer)], output
+
+    def normed(norm: Any, inputs: Any) -> None:
+        name = names[id(norm)]
+        before = came.get(id(inputs[0]), ("", None))[0]
+        folded = tensors.get(f"{before}.weight_bias")
+        if folded is not None and f"{name}.weight" not in tensors:
+            one = torch.ones_like(folded)
+            told = (one * (1.0 + norm.eps) ** 0.5, folded, 0 * one, one)
+            tensors.update(zip((f"{name}.{n}" for n in _NORM), told, strict=True))
+
+    hooks = [m.register_forward_hook(passed) for m in net.modules() if list(m.parameters(recurse=False))]
+    hooks += [m.register_forward_pre_hook(normed) for m in net.modules() if isinstance(m, nn.BatchNorm2d)]
+    net.eval()
+    with torch.no_grad():
+        net(torch.zeros(1, 3, size, size))
+        if net.corners is not None:
+            net(torch.zeros(1, 4, 3, PATCH_PX, PATCH_PX))
+    for hook in hooks:
+        hook.remove()
+    used = {name for name, _ in came.values()}
+    for name, mine in state.items():
+        layer, _, kind = name.rpartition(".")
+        if kind != "num_batches_tracked" and layer in used:  # the head fc makes no use of the neck
+            given = tensors.get(name)
+            if given is None or given.shape != mine.shape:
+                raise InputError(f"{source}: does not hold {name} of the network that it describes")
+            state[name] = given
+    return state
+
+
+_NORM = ("weight", "bias", "running_mean", "running_var")
 
 
 def _unfolded(layer: Any, kernel: np.ndarray[Any, Any]) -> Tensor:
