@@ -88,6 +88,27 @@ def test_run_over_a_folder(folder, capsys):
     assert not list((folder / "out").glob("*partial*"))
 
 
+def test_a_survey_that_is_in_doubt_leaves_more_doubt(folder, frames, tmp_path, capsys):
+    def widths(*arguments):
+        assert call(capsys, *arguments, "--out", tmp_path / "out", "--json")[0] == 0
+        lines = [json.loads(line) for line in (tmp_path / "out" / "frames.jsonl").read_text().splitlines()]
+        corners = [line["keypoints_cov_px"] for line in lines]
+        return np.array([np.diag(line["pose_cov"])[:3] for line in lines]), corners
+
+    labelled = ("run", frames, "--labels", frames / "lard.csv", "--runways", frames / "runways.json")
+    for arguments in (run_arguments(folder), labelled):
+        (sharp, seen), (wide, again) = widths(*arguments), widths(*arguments, "--survey-sigma", "2")
+        assert (wide > sharp).all()
+        assert seen == again  # what the camera saw is what it was
+    assert "survey_sigma_m is -1.0" in refused(capsys, *run_arguments(folder), "--survey-sigma=-1")
+    runway = {"length_m": RUNWAY.length_m, "width_m": RUNWAY.width_m}
+    cov = [
+        json.loads(call(capsys, "solve", problem_file(tmp_path, runway=runway | more), "--json")[1])["cov"]
+        for more in ({}, {"survey_sigma_m": 2.0})
+    ]
+    assert (np.diag(cov[1]) > 1.1 * np.diag(cov[0])).all()
+
+
 def test_run_prints_a_table_for_people(folder, capsys):
     status, out, _ = call(capsys, *run_arguments(folder))
     assert status == 0

@@ -108,6 +108,37 @@ def test_errors_are_as_large_as_the_covariance_says():
     assert abs(squared.mean() - 6) < 3 * np.sqrt(12 / 4000)
 
 
+def test_doubt_about_where_the_points_are_counts_as_it_is_seen():
+    """Surveyed with errors, and seen with unequal, correlated ones: the χ² of pose and residual, with and without."""
+    rng, survey_m = np.random.default_rng(4), 0.5
+    poses, corners, _ = approaches(6, 600)
+    truly, without = [], []
+    for pose, points in zip(poses, corners):
+        root = np.tril(rng.normal(0, 0.15, (8, 8)), -1) + np.diag(np.exp(rng.normal(np.log(0.4), 0.4, 8)))
+        there = points + rng.normal(0, survey_m, points.shape)
+        px = sf.project(CAMERA, pose, there) + (root @ rng.normal(size=8)).reshape(4, 2)
+        keypoints = sf.GaussianKeypoints(px, root @ root.T)
+        est = sf.estimate_pose(keypoints, points, CAMERA, points_sigma_m=survey_m)
+        error = est.pose.minus(pose)
+        truly.append([error @ np.linalg.solve(est.cov, error), est.residual @ est.residual])
+        bare = sf.estimate_pose(keypoints, points, CAMERA)
+        without.append(bare.residual @ bare.residual)
+        assert (np.linalg.eigvalsh(est.keypoints.cov_px - keypoints.cov_px) > -1e-9).all()
+    truly = np.array(truly)
+    # Sums of 600 χ² of 6 and of 2 degrees of freedom: four standard deviations, and 2 % for what is not linear.
+    for column, dof in zip(truly.T, (6, 2)):
+        assert abs(column.mean() / dof - 1) < 4 * np.sqrt(2 / dof / len(column)) + 0.02
+    assert np.mean(without) > 1.5 * 2  # which the monitor would take for faults
+
+
+@pytest.mark.parametrize("sigma", [-1.0, np.nan, np.inf])
+def test_a_doubt_that_is_no_length_is_refused(sigma):
+    with pytest.raises(sf.InputError, match=r"^points_sigma_m: .*; it must be 0 or more, in metres$"):
+        solve(sf.project(CAMERA, on_approach(1000), RUNWAY.corners), points_sigma_m=sigma)
+    with pytest.raises(sf.InputError, match=r"survey_sigma_m is .*; it must be from 0 to 100, in metres"):
+        sf.Runway(2000.0, 45.0, survey_sigma_m=sigma)
+
+
 def ippe_rotations(px, points):
     """OpenCV's two poses of a level plane: runway_from_camera."""
     _, turns, _, _ = cv2.solvePnPGeneric(points, px, CAMERA.matrix, None, flags=cv2.SOLVEPNP_IPPE)

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -123,6 +123,8 @@ def run(
     runway: Annotated[str, typer.Option(help="Landing direction, e.g. LFPO/24, where the labels do not say.")] = "",
     runways: Runways = None,
     size: Annotated[str, typer.Option(help="Runway length x width, m, e.g. 2000x45, instead of a database.")] = "",
+    survey_sigma: Annotated[float, typer.Option(help="How well the runway's corners are known, m, each axis: 0.5 for a "
+                                                     "survey to ICAO's 1 m.")] = 0.0,
     out: Out = Path("results/run"),
     model: Model = None,
     false_alarm_rate: Rate = 1e-3,
@@ -141,16 +143,21 @@ def run(
 ) -> None:  # fmt: skip
     """A flight, frame after frame, or each labelled image of a folder: keypoints, pose, verdict."""
     from shortfinal.runway import find_runway
-    from shortfinal.stream.source import read_camera
+    from shortfinal.stream.source import LabelledFolder, read_camera
 
     given = _sized_runway(size, runway) if size else find_runway(runway, runways) if runway else None
+    given = given and replace(given, survey_sigma_m=survey_sigma)
     lens = read_camera(camera) if camera else None
     if labels is None and not (Path(source) / "labels.csv").is_file():
         sinks = _Sinks(mavlink, video, mcap, parquet, rerun, view, copies)
         limits = _limits(alert_limits) if alert_limits else None
         _fly(source, lens, given, out, model, false_alarm_rate, box, fps, limits, sinks, as_json=as_json)
         return
-    _run_labelled(Path(source), labels, lens, given, runways, out, model, false_alarm_rate, as_json=as_json)
+    folder = LabelledFolder(
+        source, labels or Path(source) / "labels.csv", camera=lens, runway=given, database=runways,
+        survey_sigma_m=survey_sigma,
+    )  # fmt: skip
+    _run_labelled(folder, out, model, false_alarm_rate, as_json=as_json)
 
 
 def _fly(
@@ -286,14 +293,8 @@ def _limits(text: str) -> AlertLimits:
                          "axis without limit") from error  # fmt: skip
 
 
-def _run_labelled(
-    source: Path, labels: Path | None, camera: Any, runway: Any, runways: Path | None, out: Path, model: Path | None,
-    false_alarm_rate: float, *, as_json: bool,
-) -> None:  # fmt: skip
-    """Each labelled image of a folder by itself."""
-    from shortfinal.stream.source import LabelledFolder
-
-    folder = LabelledFolder(source, labels or source / "labels.csv", camera=camera, runway=runway, database=runways)
+def _run_labelled(folder: Any, out: Path, model: Path | None, false_alarm_rate: float, *, as_json: bool) -> None:
+    """Each labelled image of a `LabelledFolder` by itself."""
     if not as_json:
         _compile(levels=True)
     evaluation, results = _run_folder(folder, out, model, false_alarm_rate, quiet=as_json)

@@ -107,6 +107,10 @@ class GaussianKeypoints:
         cov[np.ix_(rows, rows)] = other.cov_px[np.ix_(rows, rows)]
         return GaussianKeypoints(mean, cov)
 
+    def widened(self, cov_px: Array) -> GaussianKeypoints:
+        """With another, independent error's covariance (2K, 2K) added."""
+        return GaussianKeypoints(self.mean_px, self.cov_px + cov_px)
+
     def block(self, k: int) -> Array:
         """Covariance (2, 2) of keypoint k, for its ellipse."""
         return self.cov_px[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]

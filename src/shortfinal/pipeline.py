@@ -303,7 +303,10 @@ class LandingPipeline:
         """
         timings = {} if timings is None else timings
         places = self.runway.corners if points is None else points
-        estimate = _timed(timings, "solve_ms", lambda: estimate_pose(keypoints, places, self.camera))
+        doubt_m = self.runway.survey_sigma_m
+        estimate = _timed(
+            timings, "solve_ms", lambda: estimate_pose(keypoints, places, self.camera, points_sigma_m=doubt_m)
+        )
         verdict, protection = _timed(timings, "doubt_ms", lambda: self._doubt(estimate))
         if verdict.decision is Decision.USE:
             self._last = estimate.pose

@@ -46,6 +46,7 @@ from shortfinal.geometry import (
     log_kernel,
     nearest_rotation,
     product_kernel,
+    project_jacobian,
     project_kernel,
 )
 from shortfinal.keypoints import GaussianKeypoints
@@ -252,6 +253,7 @@ def estimate_pose(
     altitude: Altitude | Sequence[float] | None = None,
     lines: GaussianLines | Sequence[Any] | None = None,
     edges: ArrayLike | None = None,
+    points_sigma_m: float = 0.0,
     max_iterations: int = MAX_ITERATIONS,
 ) -> PoseEstimate:
     """The most likely pose of `camera`, given where it sees `points` (K, 3; metres, runway frame).
@@ -260,12 +262,19 @@ def estimate_pose(
     holds: an attitude, a position, an altitude, and image lines of straight `edges` (L, 2, 3; both
     ends in metres). A prior as sharp as 1e-9 rad makes the attitude known.
 
+    `points_sigma_m`: how well it is known where the points are, a sigma for each axis of each by itself. It is
+    added to the keypoints' covariance as seen from the pose that they give without it, and the estimate's own
+    keypoints have it. What all points have in common (a runway surveyed whole, but elsewhere) no picture shows.
+
     `initial` is one more start beside the solver's own; `max_iterations` holds for each start.
     A physical optimum has every point in front of the camera, the camera above z = 0, and the top
     of the image upwards. Hopeless geometry is a status. Raises InputError for fewer than three
-    points, for what does not match in number, for a covariance that is none, and for a position
-    prior and an altitude that contradict each other (CONTRADICTION_SIGMAS).
+    points, for what does not match in number, for a covariance that is none, for a `points_sigma_m` that is
+    no number of 0 or more, and for a position prior and an altitude that contradict each other
+    (CONTRADICTION_SIGMAS).
     """
+    if not 0 <= points_sigma_m < math.inf:
+        raise InputError(f"points_sigma_m: {points_sigma_m}; it must be 0 or more, in metres")
     world = _as_points(points)
     count = len(world)
     _check_counts(len(keypoints.mean_px), count)
@@ -283,7 +292,22 @@ def estimate_pose(
     )  # fmt: skip
     if summary[0] == _NON_FINITE:
         as_array(world, (None, 3), "points")
-    return _estimate(solved, summary.tolist(), keypoints, world, camera, given)
+    estimate = _estimate(solved, summary.tolist(), keypoints, world, camera, given)
+    if points_sigma_m == 0 or estimate.pose is None:
+        return estimate
+    return estimate_pose(
+        keypoints.widened(_seen_cov(camera, estimate.pose, world, points_sigma_m)), world, camera,
+        initial=estimate.pose, attitude_prior=attitude_prior, position_prior=position_prior, altitude=altitude,
+        lines=lines, edges=edges, max_iterations=max_iterations,
+    )  # fmt: skip
+
+
+def _seen_cov(camera: Camera, pose: Pose, points: Array, sigma_m: float) -> Array:
+    """What a sigma of each point by itself looks like from a pose: a covariance (2K, 2K), px²."""
+    moved = project_jacobian(camera, pose, points)[:, :3].reshape(-1, 2, 3)  # of the camera: of a point, its negative
+    cov, k = np.zeros((len(points), 2, len(points), 2)), np.arange(len(points))
+    cov[k, :, k] = sigma_m**2 * moved @ moved.transpose(0, 2, 1)
+    return cov.reshape(2 * len(points), -1)
 
 
 def estimate_pose_batch(

@@ -28,7 +28,7 @@ class PoseProblem:
     keypoints: GaussianKeypoints
     points_m: Array  # (K, 3) runway frame
     camera: Camera
-    features: dict[str, Any]  # lines and priors, by estimate_pose's names for them
+    features: dict[str, Any]  # lines, priors and the points' own sigma, by estimate_pose's names for them
 
     def solve(self) -> PoseEstimate:
         """The estimate, whatever its status. Raises InputError naming the file if there is nothing to solve."""
@@ -43,7 +43,7 @@ def read_problem(path: str | Path) -> PoseProblem:
 
     {"camera": {"width", "height", "fx", "fy", "cx", "cy", "distortion"}, "keypoints_px": K x 2,
     "sigma_px": one number or K x 2, or "cov_px": 2K x 2K, "points_m": K x 3, or "runway":
-    {"length_m", "width_m"}}; and, where there is more to go by, "attitude_prior": {"yaw_deg",
+    {"length_m", "width_m", "survey_sigma_m"}}; and, where there is more to go by, "attitude_prior": {"yaw_deg",
     "pitch_deg", "roll_deg", "sigma_deg"}, "position_prior": {"position_m", "sigma_m"}, "altitude":
     {"height_m", "sigma_m"}, "lines": {"rho_px", "theta_deg", "sigma_px", "sigma_deg", "edges_m"} (the
     edges: L x 2 x 3, the runway's left and right edge if not given). A sigma is one number or one for
@@ -59,18 +59,19 @@ def read_problem(path: str | Path) -> PoseProblem:
 
 
 def _problem(content: dict[str, Any], source: str) -> PoseProblem:
-    camera = _build(Camera, _field(content, "camera"), "camera")
+    camera, features = _build(Camera, _field(content, "camera"), "camera"), _features(content)
     if "points_m" in content:
         points = as_array(content["points_m"], (None, 3), "points_m")
     else:
-        points = _build(Runway, _field(content, "runway"), "runway").corners
+        runway = _build(Runway, _field(content, "runway"), "runway")
+        points, features["points_sigma_m"] = runway.corners, runway.survey_sigma_m
     mean = _field(content, "keypoints_px")
     if "cov_px" in content:
         keypoints = GaussianKeypoints(mean, content["cov_px"])
     else:
         keypoints = GaussianKeypoints.from_sigma(mean, _field(content, "sigma_px"))
     _check_outline(keypoints)
-    return PoseProblem(source, keypoints, points, camera, _features(content))
+    return PoseProblem(source, keypoints, points, camera, features)
 
 
 def _features(content: dict[str, Any]) -> dict[str, Any]:

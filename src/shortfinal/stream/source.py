@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -54,12 +54,15 @@ class LabelledFolder:
         camera: Camera | None = None,
         runway: Runway | None = None,
         database: str | Path | None = None,
+        survey_sigma_m: float = 0.0,
     ) -> None:
-        """Raises InputError naming the file, line and field that is wrong, before any image is read."""
+        """`survey_sigma_m`: of every runway, as in `Runway`. Raises InputError naming the file, line and field that is
+        wrong, before any image is read.
+        """
         self.folder, self.labels = Path(folder), Path(labels)
         if not self.folder.is_dir():
             raise InputError(f"{folder}: no such folder of images")
-        self._camera, self._runway = camera, runway
+        self._camera, self._runway, self._survey_sigma_m = camera, runway, survey_sigma_m
         self._database: RunwayDatabase | None = None
         if database is not None:
             self._database = load_database(database)
@@ -123,7 +126,7 @@ class LabelledFolder:
         if self._database is None:
             raise InputError(f"{where}: runway {ident} needs a database; pass --runways")
         try:
-            return self._database.find(ident)
+            return replace(self._database.find(ident), survey_sigma_m=self._survey_sigma_m)
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
 
