@@ -124,6 +124,10 @@ def test_doubt_about_where_the_points_are_counts_as_it_is_seen():
         bare = sf.estimate_pose(keypoints, points, CAMERA)
         without.append(bare.residual @ bare.residual)
         assert (np.linalg.eigvalsh(est.keypoints.cov_px - keypoints.cov_px) > -1e-9).all()
+        if len(truly) < 20:  # the batch does the same
+            alike = estimate_pose_batch(px[None], root @ root.T, points, CAMERA, points_sigma_m=survey_m)
+            np.testing.assert_allclose(alike.covs[0], est.cov, rtol=1e-5)
+            assert alike.chi2[0] == pytest.approx(est.chi2, rel=1e-4, abs=1e-6)
     truly = np.array(truly)
     # Sums of 600 χ² of 6 and of 2 degrees of freedom: four standard deviations, and 2 % for what is not linear.
     for column, dof in zip(truly.T, (6, 2)):

@@ -54,6 +54,9 @@ _STYLES = {"use": "green", "do-not-use": "bold red", "not-monitored": "yellow"}
 Out = Annotated[Path, typer.Option(help="Folder for the results; made if it does not exist.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
 Model = Annotated[Path | None, typer.Option(help="Model file (ONNX); the one that ships by default.")]
+Survey = Annotated[
+    float, typer.Option(help="How well the runway's corners are known, m, each axis: 0.5 for a survey to ICAO's 1 m.")
+]
 Rate = Annotated[float, typer.Option(help="Share of faultless frames that may be refused.")]
 CameraFile = Annotated[Path | None, typer.Option(help="Camera (TOML): width, height, fx, fy, cx, cy, distortion.")]
 _DATABASE = "Runway database: LARD's JSON, or OurAirports' runways.csv or its folder."
@@ -123,8 +126,7 @@ def run(
     runway: Annotated[str, typer.Option(help="Landing direction, e.g. LFPO/24, where the labels do not say.")] = "",
     runways: Runways = None,
     size: Annotated[str, typer.Option(help="Runway length x width, m, e.g. 2000x45, instead of a database.")] = "",
-    survey_sigma: Annotated[float, typer.Option(help="How well the runway's corners are known, m, each axis: 0.5 for a "
-                                                     "survey to ICAO's 1 m.")] = 0.0,
+    survey_sigma: Survey = 0.0,
     out: Out = Path("results/run"),
     model: Model = None,
     false_alarm_rate: Rate = 1e-3,
@@ -459,6 +461,7 @@ def evaluate(
     false_alarm_rate: Rate = 1e-3,
     integrity_risk: Annotated[float, typer.Option(help="Of protection levels: P(accepted and beyond).")] = 1e-7,
     fault_prior: Annotated[float, typer.Option(help="Of protection levels: P(a feature is at fault).")] = 1e-4,
+    survey_sigma: Survey = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Of the faults that are planted.")] = 0,
     as_json: Json = False,
 ) -> None:  # fmt: skip
@@ -481,7 +484,8 @@ def evaluate(
         def held(path: Path, folder: Path) -> Evaluation:
             return judge(
                 Subject(path), data, folder, runways=runways, camera=given, corners=_names(corners), origin=origin,
-                rates=Rates(false_alarm_rate, integrity_risk, fault_prior), limits=limits, seed=seed, progress=seen,
+                rates=Rates(false_alarm_rate, integrity_risk, fault_prior, survey_sigma), limits=limits, seed=seed,
+                progress=seen,
             )  # fmt: skip
 
         made = held(subject, out)

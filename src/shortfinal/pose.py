@@ -273,8 +273,7 @@ def estimate_pose(
     no number of 0 or more, and for a position prior and an altitude that contradict each other
     (CONTRADICTION_SIGMAS).
     """
-    if not 0 <= points_sigma_m < math.inf:
-        raise InputError(f"points_sigma_m: {points_sigma_m}; it must be 0 or more, in metres")
+    _check_doubt(points_sigma_m)
     world = _as_points(points)
     count = len(world)
     _check_counts(len(keypoints.mean_px), count)
@@ -321,6 +320,7 @@ def estimate_pose_batch(
     altitude: Sequence[ArrayLike] | None = None,
     lines: Sequence[ArrayLike] | None = None,
     edges: ArrayLike | None = None,
+    points_sigma_m: float = 0.0,
     max_iterations: int = MAX_ITERATIONS,
     threads: int | None = None,
 ) -> PoseEstimateBatch:
@@ -333,8 +333,10 @@ def estimate_pose_batch(
 
     The numbers are not refused but answered: a NaN gives its problem NON_FINITE, a covariance that
     is not positive definite or a rotation that is none ILL_CONDITIONED; priors that contradict one
-    another leave a large residual. Raises InputError for shapes that do not match.
+    another leave a large residual. Raises InputError for shapes that do not match, and for a `points_sigma_m` that
+    is no number of 0 or more.
     """
+    _check_doubt(points_sigma_m)
     mean = _numbers(mean_px, "mean_px")
     if mean.ndim != 3 or mean.shape[2] != 2 or len(mean) == 0:
         raise InputError(f"mean_px: expected shape (N, K, 2) with N > 0, got {mean.shape}")
@@ -382,9 +384,20 @@ def estimate_pose_batch(
     status_codes, steps, sharp_rows = whole
     positions, rotations, covs, residuals, jacobians = solved
     mean, cov, world, line_mean, line_cov, ends, attitude, position, height = given
-    return PoseEstimateBatch(
+    batch = PoseEstimateBatch(
         positions, rotations, covs, status_codes, residuals, jacobians, chi2.copy(), steps, sharp_rows,
         relative.copy(), mean, cov, world, camera, line_mean, line_cov, ends, attitude, position, height,
+    )  # fmt: skip
+    seen = np.flatnonzero(np.isfinite(positions).all(axis=1)) if points_sigma_m > 0 else ()
+    if len(seen) == 0:
+        return batch
+    widened = np.array(np.broadcast_to(cov, (count, 2 * k, 2 * k)))
+    for i in seen:
+        pose = Pose.trusted(positions[i], rotations[i])
+        widened[i] += _seen_cov(camera, pose, world[i if len(world) == count else 0], points_sigma_m)
+    return estimate_pose_batch(
+        mean, widened, points, camera, attitude_prior=attitude_prior, position_prior=position_prior, altitude=altitude,
+        lines=lines, edges=edges, max_iterations=max_iterations, threads=threads,
     )  # fmt: skip
 
 
@@ -458,6 +471,11 @@ def _check_heights(prior: PositionPrior, altitude: Altitude) -> None:
             f"position_prior and altitude: heights of {prior.position_m[2]:.4g} m and {altitude.height_m:.4g} m are "
             f"{apart / sigma:.1f} standard deviations apart; one of them is wrong, or less certain than stated"
         )
+
+
+def _check_doubt(points_sigma_m: float) -> None:
+    if not 0 <= points_sigma_m < math.inf:
+        raise InputError(f"points_sigma_m: {points_sigma_m}; it must be 0 or more, in metres")
 
 
 def _check_counts(keypoints: int, points: int) -> None:

@@ -27,6 +27,7 @@ class Rates:
     false_alarm_rate: float = FALSE_ALARM_RATE
     integrity_risk: float = INTEGRITY_RISK
     fault_prior: float = FAULT_PRIOR
+    survey_sigma_m: float = 0.0  # of the runways' corners, as in `Runway`
 
 
 NOMINAL = Rates()
@@ -117,7 +118,9 @@ class Problems:
         status = np.full(n, None, object)
         threshold = np.nan
         for rows, camera in self.parts:
-            batch = estimate_pose_batch(mean[rows], self.cov_px[rows], points[rows], camera)
+            batch = estimate_pose_batch(
+                mean[rows], self.cov_px[rows], points[rows], camera, points_sigma_m=rates.survey_sigma_m
+            )
             verdict = check_integrity_batch(batch, rates.false_alarm_rate)
             position[rows], sigma[rows] = batch.positions, _sigma(batch)
             statistic[rows], p_value[rows], threshold = verdict.statistic, verdict.p_value, verdict.threshold
