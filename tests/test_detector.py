@@ -86,20 +86,6 @@ def test_answers_come_back_in_the_pixels_of_the_image(tmp_path):
     np.testing.assert_array_equal(kp.cov_px, look.keypoints.cov_px)
 
 
-def test_several_windows_are_seen_as_one_by_one():
-    detector = sf.KeypointDetector()
-    windows = [sf.PixelWindow(20 * n, 5 * n, 60 + 10 * n, 50, 224, 224) for n in range(3)]
-    looks = detector.look_all(PICTURE, windows)
-    assert [look.window for look in looks] == windows
-    for look, window in zip(looks, windows):
-        alone = detector.detect(PICTURE, window)
-        # float32, whose rounding may depend on how many are computed at once: 1e-6 of the side.
-        np.testing.assert_allclose(look.keypoints.mean_px, alone.mean_px, atol=1e-5 * 224)
-        np.testing.assert_allclose(look.keypoints.sigma_px, alone.sigma_px, rtol=1e-4)
-    assert np.ptp([look.keypoints.mean_px[0, 0] for look in looks]) > 1  # they do differ
-    assert detector.look_all(PICTURE, []) == []
-
-
 KNOWN = sf.GaussianKeypoints.from_sigma([[40.0, 80], [120, 78], [95, 30], [60, 31]], 0.5)
 
 

@@ -89,19 +89,12 @@ class Finder:
                     found.append(Spot(0.9, (float(centre[0]), float(centre[1])), side))
         return found
 
-    def look_all(self, image, windows):
+    def look(self, image, window):
         from shortfinal.detector import Look
 
-        looks = []
-        for window in windows:
-            middle = window.inverse(np.array([[(SIZE - 1) / 2] * 2]))[0]
-            corners = min(self.runways, key=lambda c: np.linalg.norm(c.mean(axis=0) - middle))
-            keypoints = sf.GaussianKeypoints.from_sigma(corners, 0.3)
-            looks.append(Look(window, keypoints, np.ones(4), 1.0))
-        return looks
-
-    def look(self, image, window):
-        return self.look_all(image, [window])[0]
+        middle = window.inverse(np.array([[(SIZE - 1) / 2] * 2]))[0]
+        corners = min(self.runways, key=lambda c: np.linalg.norm(c.mean(axis=0) - middle))
+        return Look(window, sf.GaussianKeypoints.from_sigma(corners, 0.3), np.ones(4), 1.0)
 
 
 @pytest.fixture(scope="module")

@@ -52,7 +52,7 @@ def record_of(n, rng, frames=FRAMES):
     if n in BLIND:
         record |= {
             "decision": "not-monitored", "reasons": ["no runway in view (its probability is 0.02)"], "statistic": None,
-            "p_value": None, "dof": 0, "present": 0.02, "crop": [200.0, 150.0, 90.0, 90.0], "end_crops": [],
+            "p_value": None, "dof": 0, "present": 0.02, "crop": [200.0, 150.0, 90.0, 90.0],
         }  # fmt: skip
     else:
         px = sf.project(CAMERA, truth, RUNWAY.corners)
@@ -71,7 +71,7 @@ def record_of(n, rng, frames=FRAMES):
         record |= {
             "decision": verdict.decision.value, "reasons": list(verdict.reasons), "statistic": verdict.statistic,
             "p_value": verdict.p_value, "dof": verdict.dof, "present": 0.999,
-            "crop": [*((low + high) / 2 - side / 2), side, side], "end_crops": [],
+            "crop": [*((low + high) / 2 - side / 2), side, side],
             "keypoints_px": keypoints.mean_px.tolist(), "keypoints_cov_px": keypoints.cov_px.tolist(),
             "status": estimate.status.value, "position_m": estimate.pose.position_m.tolist(),
             "attitude_deg": list(estimate.pose.attitude), "pose_cov": estimate.cov.tolist(),
@@ -538,7 +538,7 @@ def test_light_and_dark(opened, replay):
 
 
 def test_a_flight_without_track_truth_pictures_or_limits_is_shown(opened, records, tmp_path):
-    bare = [{k: v for k, v in r.items() if k not in ("track", "truth", "end_crops")} for r in records[:60]]
+    bare = [{k: v for k, v in r.items() if k not in ("track", "truth")} for r in records[:60]]
     bare[7]["reasons"] = ["</script><script>alert(1)</script> & <b>bold</b>"]
     flight = {"format": 1, "camera": FLIGHT["camera"], "runway": FLIGHT["runway"], "stages": None, "alert_limits": None}
     page = opened(write_replay(write_folder(tmp_path, bare, flight, pictures=False)).as_uri())

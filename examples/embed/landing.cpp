@@ -28,8 +28,11 @@ namespace {
 
 constexpr int CORNERS = 4;
 // Constants of pipeline.py.
-constexpr double WIDE_MARGIN = 1.9, PRESENT = 0.5, END_MARGIN = 1.6, SHARPER = 1.5, MAGNIFIED = 2.0, FLAT = 1.5;
+constexpr double WIDE_MARGIN = 1.9, PRESENT = 0.5, FLAT = 1.5;
 constexpr int LOOKS = 3;
+// Of detector.py and crops.py.
+constexpr int CORNER_LOOKS = 2, PATCH = 48;
+constexpr double VISIBLE = 0.5, HALF = 24.0, OF_WIDTH = 0.25, SIGMAS = 5.0, NARROWEST = 0.42261826174069944;  // sin 25
 constexpr double FALSE_ALARM_RATE = 1e-3, INTEGRITY_RISK = 1e-7, FAULT_PRIOR = 1e-4;
 
 using Pixels = std::array<double, 2 * CORNERS>;                   // u0, v0, u1, v1, ...
@@ -128,53 +131,71 @@ struct Window {
 
 int floor_div(int a, int b) { return static_cast<int>(std::floor(static_cast<double>(a) / b)); }
 
-// Means of blocks of k x k pixels, those that `window` needs; where the first block begins, in pixels.
-Image block_means(const Image &image, const Window &window, int k, int (&start)[2]) {
+// From a picture's pixels (u, v, 1) to the image's.
+struct Affine {
+    double m[2][3];
+
+    double operator()(double u, double v, int axis) const { return m[axis][0] * u + m[axis][1] * v + m[axis][2]; }
+};
+
+// Means of blocks of k[0] x k[1] pixels, from `low` to `high` (from the image's edge); where the first begins, in pixels.
+Image block_means(const Image &image, const double (&low)[2], const double (&high)[2], const int (&k)[2], int (&start)[2]) {
     const int extent[2] = {image.width, image.height};
     int count[2];
     for (int axis = 0; axis < 2; ++axis) {
-        const double low = axis ? window.top : window.left;
-        const int origin = static_cast<int>(std::floor(low + 1e-6));
-        const int needed = static_cast<int>(std::ceil((low + window.side - origin) / k - 1e-6));
-        const int first = std::max(0, floor_div(-origin, k));
-        const int last = std::min(needed, -floor_div(origin - extent[axis], k));
-        start[axis] = origin + first * k;
+        const int origin = static_cast<int>(std::floor(low[axis] + 1e-6));
+        const int needed = static_cast<int>(std::ceil((high[axis] - origin) / k[axis] - 1e-6));
+        const int first = std::max(0, floor_div(-origin, k[axis]));
+        const int last = std::min(needed, -floor_div(origin - extent[axis], k[axis]));
+        start[axis] = origin + first * k[axis];
         count[axis] = std::max(0, last - first);
     }
     Image out{count[0], count[1], std::vector<uint8_t>(3 * static_cast<size_t>(count[0]) * count[1])};
     uint8_t *to = out.rgb.data();
+    const double area = k[0] * k[1];
     for (int y = 0; y < out.height; ++y)
         for (int x = 0; x < out.width; ++x)
             for (int c = 0; c < 3; ++c) {
                 double total = 0.0;
-                for (int j = 0; j < k; ++j)
-                    for (int i = 0; i < k; ++i) total += image.at(start[0] + x * k + i, start[1] + y * k + j, c);
-                // OpenCV rounds halves up for blocks of two, to even otherwise.
-                *to++ = static_cast<uint8_t>(k == 2 ? std::floor(total / 4.0 + 0.5) : std::nearbyint(total / (k * k)));
+                for (int j = 0; j < k[1]; ++j)
+                    for (int i = 0; i < k[0]; ++i)
+                        total += image.at(start[0] + x * k[0] + i, start[1] + y * k[1] + j, c);
+                // OpenCV rounds halves up for blocks of 2 x 2, to even otherwise.
+                const bool up = k[0] == 2 && k[1] == 2;
+                *to++ = static_cast<uint8_t>(up ? std::floor(total / 4.0 + 0.5) : std::nearbyint(total / area));
             }
     return out;
 }
 
-// crop_image of detector.py: blocks averaged where the image shrinks by two or more, then bilinear.
-Image crop(const Image &image, const Window &window) {
-    double step = 1.0 / window.scale(), offset[2] = {window.inverse(0.0, 0), window.inverse(0.0, 1)};
-    const int k = std::max(1, static_cast<int>(std::floor(step + 1e-6)));
-    Image means;
-    if (k > 1) {
-        int start[2];
-        means = block_means(image, window, k, start);
-        step /= k;
-        for (int axis = 0; axis < 2; ++axis) offset[axis] = (offset[axis] + 0.5 - start[axis]) / k - 0.5;
+// warp_image of detector.py, of a square picture: blocks averaged where the image shrinks by two or more, then bilinear.
+Image warp(const Image &image, Affine map, int size) {
+    int k[2], start[2] = {0, 0};
+    double low[2], high[2];
+    for (int axis = 0; axis < 2; ++axis) {
+        k[axis] = std::max(1, static_cast<int>(std::floor(std::hypot(map.m[axis][0], map.m[axis][1]) + 1e-6)));
+        for (int corner = 0; corner < 4; ++corner) {
+            const double edge = map(corner % 2 ? size - 0.5 : -0.5, corner / 2 ? size - 0.5 : -0.5, axis) + 0.5;
+            low[axis] = corner ? std::min(low[axis], edge) : edge;
+            high[axis] = corner ? std::max(high[axis], edge) : edge;
+        }
     }
-    const Image &from = k > 1 ? means : image;
-    Image out{window.size, window.size, std::vector<uint8_t>(3 * static_cast<size_t>(window.size) * window.size)};
+    Image means;
+    const bool shrinks = std::max(k[0], k[1]) > 1;
+    if (shrinks) {
+        means = block_means(image, low, high, k, start);
+        for (int axis = 0; axis < 2; ++axis) {
+            map.m[axis][2] += 0.5 - start[axis];
+            for (double &entry : map.m[axis]) entry /= k[axis];
+            map.m[axis][2] -= 0.5;
+        }
+    }
+    const Image &from = shrinks ? means : image;
+    Image out{size, size, std::vector<uint8_t>(3 * static_cast<size_t>(size) * size)};
     uint8_t *to = out.rgb.data();
-    for (int row = 0; row < window.size; ++row) {
-        const double y = offset[1] + row * step;
-        const int y0 = static_cast<int>(std::floor(y));
-        for (int column = 0; column < window.size; ++column) {
-            const double x = offset[0] + column * step;
-            const int x0 = static_cast<int>(std::floor(x));
+    for (int row = 0; row < size; ++row)
+        for (int column = 0; column < size; ++column) {
+            const double x = map(column, row, 0), y = map(column, row, 1);
+            const int x0 = static_cast<int>(std::floor(x)), y0 = static_cast<int>(std::floor(y));
             const double a = x - x0, b = y - y0;
             for (int c = 0; c < 3; ++c) {
                 const double above = (1 - a) * from.at(x0, y0, c) + a * from.at(x0 + 1, y0, c);
@@ -182,8 +203,12 @@ Image crop(const Image &image, const Window &window) {
                 *to++ = static_cast<uint8_t>(std::nearbyint((1 - b) * above + b * below));
             }
         }
-    }
     return out;
+}
+
+Image crop(const Image &image, const Window &window) {
+    const double step = 1.0 / window.scale();
+    return warp(image, {{{step, 0.0, window.inverse(0.0, 0)}, {0.0, step, window.inverse(0.0, 1)}}}, window.size);
 }
 
 double spread(const Image &image) {  // standard deviation of the levels
@@ -215,7 +240,6 @@ struct Look {
     Pixels mean{};      // of the frame
     Covariance cov{};   // likewise, px^2
     double visible = 0;  // of the corners, the least
-    std::array<double, CORNERS> each{};
     double present = 0;
 };
 
@@ -238,37 +262,107 @@ public:
             mean_[c] = static_cast<float>(info["mean"].items.at(c).number);
             std_[c] = static_cast<float>(info["std"].items.at(c).number);
         }
+        for (size_t i = 0; i < session_.GetOutputCount(); ++i)
+            sharpens_ = sharpens_ || std::string(session_.GetOutputNameAllocated(i, allocator).get()) == "corner_px";
         gain_.fill(1.0);
         if (const Json &calibration = info["calibration"]; !calibration.members.empty())
             for (int i = 0; i < 2 * CORNERS; ++i) gain_[i] = calibration["sigma_scale"].items.at(i).number;
     }
 
-    std::vector<Look> look(const Image &frame, const std::vector<Window> &windows) {
-        const int64_t n = static_cast<int64_t>(windows.size()), plane = static_cast<int64_t>(size) * size;
-        std::vector<float> input(n * 3 * plane);
-        for (int64_t i = 0; i < n; ++i) {
-            const Image picture = crop(frame, windows[i]);
-            for (int64_t p = 0; p < plane; ++p)
-                for (int c = 0; c < 3; ++c)
-                    input[(i * 3 + c) * plane + p] = (picture.rgb[3 * p + c] / 255.0f - mean_[c]) / std_[c];
-        }
-        const std::array<int64_t, 4> shape{n, 3, size, size};
-        const auto memory = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);
-        const auto tensor = Ort::Value::CreateTensor<float>(memory, input.data(), input.size(), shape.data(), shape.size());
+    Look look(const Image &frame, const Window &window) {
+        std::vector<float> input(3 * static_cast<size_t>(size) * size);
+        normalise(crop(frame, window), input.data());
+        const auto given = tensor(input, {1, 3, size, size});
         const char *in[] = {"image"}, *out[] = {"mean_px", "cov_px", "visible", "present"};
-        const auto answers = session_.Run(Ort::RunOptions{nullptr}, in, &tensor, 1, out, 4);
-        const float *mean = answers[0].GetTensorData<float>(), *cov = answers[1].GetTensorData<float>();
-        const float *visible = answers[2].GetTensorData<float>(), *present = answers[3].GetTensorData<float>();
-        std::vector<Look> looks(n);
-        for (int64_t i = 0; i < n; ++i, mean += 8, cov += 64, visible += 4, ++present)
-            looks[i] = in_frame(windows[i], mean, cov, visible, *present);
-        return looks;
+        const auto answers = session_.Run(Ort::RunOptions{nullptr}, in, &given, 1, out, 4);
+        return in_frame(window, answers[0].GetTensorData<float>(), answers[1].GetTensorData<float>(),
+                        answers[2].GetTensorData<float>(), *answers[3].GetTensorData<float>());
+    }
+
+    // Each corner looked at by itself, in a patch of its own; one that is not seen there stays as it is. What is said of
+    // the others is independent of it.
+    void sharpen(const Image &frame, Look &look) {
+        for (int again = 0; sharpens_ && again < CORNER_LOOKS; ++again) {
+            const auto maps = corner_patches(look);
+            std::vector<float> patches(4 * 3 * static_cast<size_t>(PATCH) * PATCH), nothing;
+            for (int k = 0; k < CORNERS; ++k)
+                normalise(warp(frame, maps[k], PATCH), patches.data() + k * 3 * static_cast<size_t>(PATCH) * PATCH);
+            bool yes = true;
+            const auto memory = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);
+            std::array<Ort::Value, 3> given{tensor(nothing, {0, 3, size, size}), tensor(patches, {1, 4, 3, PATCH, PATCH}),
+                                            Ort::Value::CreateTensor<bool>(memory, &yes, 1, nullptr, 0)};
+            const char *in[] = {"image", "patches", "sharpen"}, *out[] = {"corner_px", "corner_cov_px", "corner_visible"};
+            const auto answers = session_.Run(Ort::RunOptions{nullptr}, in, given.data(), 3, out, 3);
+            const float *mean = answers[0].GetTensorData<float>(), *cov = answers[1].GetTensorData<float>();
+            const float *visible = answers[2].GetTensorData<float>();
+            const auto seen = [&](int row) { return visible[row / 2] >= VISIBLE; };
+            for (int r = 0; r < 8; ++r) {
+                if (seen(r)) look.mean[r] = maps[r / 2](mean[r / 2 * 2], mean[r / 2 * 2 + 1], r % 2);
+                for (int c = 0; c < 8; ++c) {
+                    double entry = 0.0;  // A cov A^T, A from the patch to the frame
+                    for (int i = 0; i < 2; ++i)
+                        for (int j = 0; j < 2; ++j) {
+                            const int a = r / 2 * 2 + i, b = c / 2 * 2 + j;
+                            const double both = 0.5 * (static_cast<double>(cov[8 * a + b]) + cov[8 * b + a]);
+                            entry += maps[r / 2].m[r % 2][i] * both * maps[c / 2].m[c % 2][j];
+                        }
+                    if (seen(r) && seen(c)) look.cov[8 * r + c] = entry * gain_[r] * gain_[c];
+                    if (seen(r) != seen(c)) look.cov[8 * r + c] = 0.0;
+                }
+            }
+            for (int r = 0; r < 8; ++r)
+                if (!std::isfinite(look.mean[r]) || !(look.cov[9 * r] > 0.0))
+                    throw std::runtime_error("the network's answer is no Gaussian");
+        }
     }
 
     int size = 0;
     double margin = 0;
 
 private:
+    void normalise(const Image &picture, float *planes) const {
+        const size_t plane = static_cast<size_t>(picture.width) * picture.height;
+        for (size_t p = 0; p < plane; ++p)
+            for (int c = 0; c < 3; ++c) planes[c * plane + p] = (picture.rgb[3 * p + c] / 255.0f - mean_[c]) / std_[c];
+    }
+
+    static Ort::Value tensor(std::vector<float> &values, const std::vector<int64_t> &shape) {
+        const auto memory = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);
+        return Ort::Value::CreateTensor<float>(memory, values.data(), values.size(), shape.data(), shape.size());
+    }
+
+    // crops.py's: for each corner, x along its end, y along its edge, as long as the end is wide or the look in doubt.
+    static std::array<Affine, CORNERS> corner_patches(const Look &look) {
+        std::array<Affine, CORNERS> maps{};
+        for (int k = 0; k < CORNERS; ++k) {
+            const double *here = look.mean.data() + 2 * k;
+            double x[2], y[2];
+            const double width = direction(here, look.mean.data() + 2 * (k ^ 1), x);
+            direction(here, look.mean.data() + 2 * (3 - k), y);
+            const double turn = x[0] * y[1] - x[1] * y[0];
+            if (std::abs(turn) < NARROWEST) {
+                const double side = turn >= 0 ? 1.0 : -1.0, ahead = x[0] * y[0] + x[1] * y[1] >= 0 ? 1.0 : -1.0;
+                const double along = ahead * std::sqrt(1 - NARROWEST * NARROWEST);
+                y[0] = along * x[0] - NARROWEST * side * x[1];
+                y[1] = along * x[1] + NARROWEST * side * x[0];
+            }
+            const double doubt = std::sqrt(std::max(look.cov[18 * k], look.cov[18 * k + 9]));
+            const double half = std::max({std::min(HALF, width), OF_WIDTH * width, SIGMAS * doubt, 2.0});
+            for (int axis = 0; axis < 2; ++axis) {
+                double *row = maps[k].m[axis];
+                row[0] = x[axis] * half / (PATCH / 2), row[1] = y[axis] * half / (PATCH / 2);
+                row[2] = here[axis] - (row[0] + row[1]) * (PATCH - 1) / 2;
+            }
+        }
+        return maps;
+    }
+
+    static double direction(const double *from, const double *to, double (&unit)[2]) {
+        const double length = std::hypot(to[0] - from[0], to[1] - from[1]);
+        for (int axis = 0; axis < 2; ++axis) unit[axis] = length > 0 ? (to[axis] - from[axis]) / length : 1.0 - axis;
+        return length;
+    }
+
     Look in_frame(const Window &window, const float *mean, const float *cov, const float *visible, float present) const {
         Look look;
         look.window = window;
@@ -283,8 +377,7 @@ private:
         for (double value : look.cov) finite = finite && std::isfinite(value);
         for (int i = 0; i < CORNERS; ++i) finite = finite && visible[i] >= 0 && visible[i] <= 1;
         if (!finite) throw std::runtime_error("the network's answer is no Gaussian");
-        std::copy(visible, visible + CORNERS, look.each.begin());
-        look.visible = *std::min_element(look.each.begin(), look.each.end());
+        look.visible = *std::min_element(visible, visible + CORNERS);
         look.present = present;
         return look;
     }
@@ -293,6 +386,7 @@ private:
     Ort::Session session_;
     float mean_[3] = {}, std_[3] = {};
     std::array<double, 2 * CORNERS> gain_{};
+    bool sharpens_ = false;
 };
 
 // ---- Where to look, and what was seen: `see` of pipeline.py.
@@ -327,60 +421,20 @@ bool frames(const Look &look, double margin) {
     return std::max(box[2] - box[0], box[3] - box[1]) > 0.8 / margin;
 }
 
-// The crop for one end: its width and a half, and three sigma of where it is to either side.
-Window around_end(const Look &look, int end, int size) {
-    const Box box = box_around(look.mean.data() + 4 * end, 2);
-    const double width = std::max({box[2] - box[0], box[3] - box[1], 1.0});
-    double variance = 0.0;
-    for (int i = 4 * end; i < 4 * end + 4; ++i) variance = std::max(variance, look.cov[9 * i]);
-    const double u = 0.5 * (box[0] + box[2]), v = 0.5 * (box[1] + box[3]), half = width / 2;
-    return centre_crop({u - half, v - half, u + half, v + half}, END_MARGIN + 6 * std::sqrt(variance) / width, size);
-}
-
-bool holds(const Look &look, int end) {
-    for (int i = 4 * end; i < 4 * end + 4; ++i)
-        if (!(std::abs(look.window.apply(look.mean[i], i % 2) / (look.window.size - 1) - 0.5) < 0.47)) return false;
-    return look.each[2 * end] >= PRESENT && look.each[2 * end + 1] >= PRESENT;
-}
-
-// Each end from a look of its own, where that shows it larger; the two are taken as independent.
-void sharpen(Network &network, const Image &frame, Look &look) {
-    if (look.window.scale() >= MAGNIFIED) return;
-    std::vector<Window> windows;
-    std::vector<int> ends;
-    for (int end = 0; end < 2; ++end) {
-        const Window window = around_end(look, end, network.size);
-        if (window.scale() > SHARPER * look.window.scale()) windows.push_back(window), ends.push_back(end);
-    }
-    if (windows.empty()) return;
-    const std::vector<Look> again = network.look(frame, windows);
-    for (size_t w = 0; w < windows.size(); ++w) {
-        const int first = 4 * ends[w];
-        if (!holds(again[w], ends[w])) continue;
-        for (int r = first; r < first + 4; ++r) {
-            look.mean[r] = again[w].mean[r];
-            for (int c = 0; c < 8; ++c) {
-                const bool own = c >= first && c < first + 4;
-                look.cov[8 * r + c] = look.cov[8 * c + r] = own ? again[w].cov[8 * r + c] : 0.0;
-            }
-        }
-    }
-}
-
 // The look, and in `obstacle` why its keypoints are not to be used; empty if they may be.
 Look see(Network &network, const Image &frame, const Box &box, std::string &obstacle) {
     if (box[2] < 0 || box[3] < 0 || box[0] >= frame.width || box[1] >= frame.height)
         return obstacle = "the runway's box lies outside the frame", Look{};
     const Window first = centre_crop(box, network.margin, network.size);
     if (spread(crop(frame, first)) < FLAT) return obstacle = "nothing to see: the crop is flat", Look{};
-    Look look = network.look(frame, {first})[0];
+    Look look = network.look(frame, first);
     for (int i = 1; i < LOOKS && !frames(look, network.margin); ++i) {
         const double wider = look.visible >= PRESENT ? network.margin : WIDE_MARGIN;
-        look = network.look(frame, {centre_crop(box_around(look.mean.data(), CORNERS), wider, network.size)})[0];
+        look = network.look(frame, centre_crop(box_around(look.mean.data(), CORNERS), wider, network.size));
     }
     if (look.present < PRESENT) return obstacle = "no runway in view", look;
     if (!frames(look, network.margin)) return obstacle = "the runway does not settle inside the crop", look;
-    sharpen(network, frame, look);
+    network.sharpen(frame, look);
     for (int i = 0; i < 8; ++i) {
         const double reach = 2 * std::sqrt(look.cov[9 * i]), last = (i % 2 ? frame.height : frame.width) - 1;
         if (look.mean[i] < reach || look.mean[i] > last - reach)

@@ -170,12 +170,8 @@ class KeypointDetector:
         The window must have the model's input size. Raises InputError for another image type or
         window, and when the network's answer is not a Gaussian (non-finite).
         """
-        return self.look_all(image, [window])[0]
-
-    def look_all(self, image: Image, windows: Sequence[PixelWindow]) -> list[Look]:
-        """What it sees within several windows of one image, from one call of the network; as `look`."""
-        answers = self._run(image, windows, OUTPUTS)
-        return [self._look(window, *answer) for window, *answer in zip(windows, *answers, strict=True)]
+        (answer,) = zip(*self._run(image, [window], OUTPUTS), strict=True)
+        return self._look(window, *answer)
 
     @property
     def searches(self) -> bool:

@@ -36,10 +36,6 @@ CERTAIN, LIKELY = (0.999, 0.9, 0.09), (0.9, 0.5, 0.18)
 FOLLOWED = 6  # spots of a frame, at most, that are looked at closely
 LOOKS = 3  # crops at most, for a frame
 PRESENT = 0.5  # probability of a runway below which there is none
-ENDS = (slice(0, 2), slice(2, 4))  # the keypoints of the near end and of the far one
-END_MARGIN = 1.6  # of the crop around one end: its side over the end's width, beside the first look's doubt
-SHARPER = 1.5  # an end is looked at again where that enlarges it by so much,
-MAGNIFIED = 2.0  # and the first crop magnifies the frame by less: else there is nothing more to see
 COMPARED_ROWS = 16  # every so many of a picture's rows tell whether it is the last one once more
 FLAT = 1.5  # standard deviation of a crop's levels, of 255, below which nothing can be in it
 
@@ -56,7 +52,6 @@ class FrameResult:
     protection: ProtectionLevels | None = None  # what bounds the error of an accepted frame; None if not monitored
     timings: dict[str, float] = field(default_factory=dict)  # "detect_ms", "solve_ms", "doubt_ms"
     present: float | None = None  # probability that a runway is in the crop
-    end_crops: tuple[PixelWindow, ...] = ()  # where it looked again, for one end each
     calibrated_on: str | None = None  # what the keypoints' sigma was mended with; None: it is the network's own
     bounds_95_px: Array | None = None  # (K, 2) split-conformal: 95 % of the errors are no larger; None: not calibrated
     track: Track | None = None  # over time, this frame included; None without a tracker
@@ -74,7 +69,6 @@ class FrameResult:
         }
         if self.crop is not None:
             record["crop"] = _bounds(self.crop)
-            record["end_crops"] = [_bounds(crop) for crop in self.end_crops]
             record["present"] = self.present
         if self.keypoints is not None:
             record["keypoints_px"] = self.keypoints.mean_px.tolist()
@@ -284,7 +278,7 @@ class LandingPipeline:
         return [across[{"L": 0, "C": len(across) // 2, "R": -1}[self._side]]]
 
     def _judged(self, sight: Sight, timestamp_s: float, timings: dict[str, float]) -> FrameResult:
-        seen = (sight.look.present, sight.end_crops, *self._bounds(sight))
+        seen = (sight.look.present, *self._bounds(sight))
         crop, keypoints = sight.look.window, sight.keypoints.only(sight.seen)
         if sight.obstacle:
             verdict = self._not_monitored(sight.obstacle)
@@ -371,7 +365,6 @@ class Sight:
     look: Look
     keypoints: GaussianKeypoints  # all of the model's, in the frame's pixels
     obstacle: str  # why the keypoints are not to be used; nothing if they may be
-    end_crops: tuple[PixelWindow, ...] = ()
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -380,7 +373,9 @@ class Sight:
 
 
 def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float | None = None) -> Sight:
-    """Crop and detect; again where the runway was found, until the crop frames it; then at each end.
+    """Crop and detect; again where the runway was found, until the crop frames it; then each corner by itself, if
+    the model knows how: the crop that holds the whole of a near runway shows its far end, on which the monitor's
+    power rests, a few pixels wide.
 
     `box` (4,): left, top, right, bottom around the runway, in the frame's pixels; `margin` of the first
     crop around it, the model's own if not given. A network must name four corners, even of a runway that
@@ -401,8 +396,8 @@ def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float 
         return Sight(look, look.keypoints, f"no runway in view (its probability is {look.present:.2g})")
     if not _frames(look, own):
         return Sight(look, look.keypoints, f"the runway does not settle inside the crop in {LOOKS} looks")
-    keypoints, end_crops = _sharpened(detector, frame, look)
-    return Sight(look, keypoints, _cut_off(keypoints, frame.shape[1], frame.shape[0]), end_crops)
+    keypoints = detector.sharpened(frame, look.keypoints) if detector.sharpens else look.keypoints
+    return Sight(look, keypoints, _cut_off(keypoints, frame.shape[1], frame.shape[0]))
 
 
 def _sight_at(detector: KeypointDetector, frame: Image, spot: Spot, limits: tuple[float, float, float]) -> Sight | None:
@@ -416,7 +411,8 @@ def _sight_at(detector: KeypointDetector, frame: Image, spot: Spot, limits: tupl
     except InputError:  # a place of no use
         return None
     present, visible, share = limits
-    vague = float(sight.keypoints.sigma_px[:4].max()) > share * _spot_of(sight).side_px
+    # By the look at the whole: a field's corner is sharp, too.
+    vague = float(sight.look.keypoints.sigma_px[:4].max()) > share * _spot_of(sight).side_px
     doubtful = sight.look.present < present or sight.look.visible[:4].min() < visible
     return None if sight.obstacle or vague or doubtful else sight
 
@@ -428,32 +424,6 @@ def _spot_of(sight: Sight) -> Spot:
     return Spot(sight.look.present, (u, v), float((box[2:] - box[:2]).max()))
 
 
-def _sharpened(
-    detector: KeypointDetector, frame: Image, look: Look
-) -> tuple[GaussianKeypoints, tuple[PixelWindow, ...]]:
-    """The keypoints with each corner from looks of its own, if the model knows how. If not, with each end from one,
-    where that shows it larger; and those looks' windows.
-
-    The crop that holds the whole of a near runway shows its far end, on which the monitor's power
-    rests, a few pixels wide. What two looks say of two ends is taken as independent.
-    """
-    known = look.keypoints
-    if detector.sharpens:
-        return detector.sharpened(frame, known), ()
-    if look.window.scale[0] >= MAGNIFIED:
-        return known, ()
-    windows = {end: _around_end(known, end, detector.info.size) for end in range(len(ENDS))}
-    windows = {end: w for end, w in windows.items() if w.scale[0] > SHARPER * look.window.scale[0]}
-    if not windows:
-        return known, ()
-    for end, again in zip(windows, detector.look_all(frame, list(windows.values())), strict=True):
-        corners = ENDS[end]
-        if again.visible[corners].min() < VISIBLE or not _holds(again.window, again.keypoints.mean_px[corners]):
-            continue  # the first look stands
-        known = known.replaced(range(corners.start, corners.stop), again.keypoints)
-    return known, tuple(windows.values())
-
-
 def _cut_off(keypoints: GaussianKeypoints, width: int, height: int) -> str:
     """Which corner is at the frame's border, to within 2 sigma: it may lie beyond, unseen."""
     reach = 2 * keypoints.sigma_px
@@ -462,21 +432,6 @@ def _cut_off(keypoints: GaussianKeypoints, width: int, height: int) -> str:
     if not outside.any():
         return ""
     return f"the {CORNER_NAMES[int(outside.argmax())]} corner lies at the border of the frame, or beyond it"
-
-
-def _around_end(known: GaussianKeypoints, end: int, size: int) -> PixelWindow:
-    """The crop for one end: its width and a half, and three sigma of where it is to either side."""
-    box = box_around(known.mean_px[ENDS[end]])
-    width = max(float((box[2:] - box[:2]).max()), 1.0)
-    centre = (box[:2] + box[2:]) / 2
-    margin = END_MARGIN + 6 * float(known.sigma_px[ENDS[end]].max()) / width
-    return centre_crop(np.concatenate([centre - width / 2, centre + width / 2]), margin, size)
-
-
-def _holds(window: PixelWindow, corners_px: Array) -> bool:
-    """Whether corners (n, 2) lie in the window, 3 % of its side from its borders."""
-    inside = window.apply(corners_px) / (window.out_width - 1)
-    return bool((np.abs(inside - 0.5) < 0.47).all())
 
 
 def _bounds(window: PixelWindow) -> list[float]:

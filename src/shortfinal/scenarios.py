@@ -374,11 +374,8 @@ class _Locked:
         return self._detector.spots(image, windows)
 
     def look(self, image: Image, window: PixelWindow) -> Look:
-        return self.look_all(image, [window])[0]
-
-    def look_all(self, image: Image, windows: Sequence[PixelWindow]) -> list[Look]:
-        looks = self._detector.look_all(image, windows)
-        return [replace(look, keypoints=_moved(look.keypoints, self._shift)) for look in looks]
+        look = self._detector.look(image, window)
+        return replace(look, keypoints=_moved(look.keypoints, self._shift))
 
     def sharpened(self, image: Image, keypoints: GaussianKeypoints, looks: int = CORNER_LOOKS) -> GaussianKeypoints:
         true = self._detector.sharpened(image, _moved(keypoints, -self._shift), looks)

@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shortfinal.crops import centre_crop
 from shortfinal.errors import InputError, JobError
 from shortfinal.geometry import Pose, project
 from shortfinal.keypoints import GaussianKeypoints
-from shortfinal.pipeline import ENDS, FrameResult, LandingPipeline
+from shortfinal.pipeline import FrameResult, LandingPipeline
 from shortfinal.protection import AlertLimits
 from shortfinal.search import Search
 from shortfinal.stream.frames import FrameSource, Mailbox, TimedFrame
@@ -301,8 +300,8 @@ def warm_up(pipeline: LandingPipeline) -> float:
         other.step(noise, 1.0, box=box)
     with suppress(InputError):  # a network that cannot search, or makes nothing of noise
         Search(camera.width, camera.height, detector.info.size).look(detector, noise)
-    with suppress(InputError):
-        detector.look_all(noise, [centre_crop(middle, detector.info.margin, detector.info.size)] * len(ENDS))
+    with suppress(InputError):  # or look at corners
+        detector.sharpened(noise, GaussianKeypoints.from_sigma(middle[[[0, 3], [2, 3], [2, 1], [0, 1]]], 1.0))
     return time.perf_counter() - start
 
 

@@ -189,10 +189,8 @@ def row_of(record: Mapping[str, Any], end_m: float) -> Row:
             numbers[name] = float(record[name])
     for stage, ms in (record.get("timings") or {}).items():
         numbers[f"ms_{str(stage).removesuffix('_ms')}"] = float(ms)
-    crops = [record.get("crop"), *(record.get("end_crops") or ())]
-    for n, crop in enumerate(crops[:3]):
-        if crop is not None:
-            numbers |= _named(f"crop{n}_", ("left", "top", "width", "height"), crop)
+    if record.get("crop") is not None:
+        numbers |= _named("crop_", ("left", "top", "width", "height"), record["crop"])
     numbers |= _keypoints(record.get("keypoints_px"), record.get("keypoints_cov_px"))
     numbers |= _pose("", record, "pose_cov", end_m)
     protection = record.get("protection")

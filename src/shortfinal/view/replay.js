@@ -197,11 +197,11 @@ function drawWindow(canvas, height, view, thick) {
     for (const [width, style] of [[thick + 2, "rgba(0,0,0,.45)"], [thick, colour]]) { ctx.lineWidth = width; ctx.strokeStyle = style; ctx.stroke(); }
     ctx.setLineDash([]);
   };
-  if (shown.crop) for (let n = 0; n < 3; n++) {
-    const [left, top, width, tall] = ["left", "top", "width", "height"].map(name => at(`crop${n}_${name}`, i));
+  if (shown.crop) {
+    const [left, top, width, tall] = ["left", "top", "width", "height"].map(name => at("crop_" + name, i));
     if (width > 0) {
       const [l, t] = [left - 0.5, top - 0.5];
-      path([[l, t], [l + width, t], [l + width, t + tall], [l, t + tall]], n ? "rgba(255,255,255,.6)" : DRAWN.crop, n ? [2, 3] : [6, 4], true);
+      path([[l, t], [l + width, t], [l + width, t + tall], [l, t + tall]], DRAWN.crop, [6, 4], true);
     }
   }
   const runwayBy = (prefix, colour, dash) => {
@@ -224,7 +224,7 @@ function drawWindow(canvas, height, view, thick) {
 }
 /** Square around the runway: where the network looked, else where it was found or should be. */
 function closeUp(i) {
-  const [left, top, width, height] = ["left", "top", "width", "height"].map(name => at("crop0_" + name, i));
+  const [left, top, width, height] = ["left", "top", "width", "height"].map(name => at("crop_" + name, i));
   if (width > 0) {
     const u = [left, left + width], v = [top, top + height], reach = Math.max(width, height) / 2;
     for (let k = 0; has(`k${k}_u`); k++) for (const [span, px, middle] of [[u, at(`k${k}_u`, i), left + width / 2], [v, at(`k${k}_v`, i), top + height / 2]]) {
