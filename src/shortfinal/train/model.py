@@ -91,8 +91,9 @@ class KeypointNet(nn.Module):
         # Of each keypoint: the features where it is looked for, those of the whole picture, and how
         # widely it is looked for.
         told = deep + (inner + 2 if head == "sam" else 0)
-        self.spread = _OfEach(keypoints, told, _HIDDEN, 3)  # two variances, visible
-        nn.init.constant_(self.spread.bias_out[:, :2], _FIRST_LOG_VARIANCE)
+        self.spread = nn.ModuleList([_layers(told, _HIDDEN, 3) for _ in range(keypoints)])  # two variances, visible
+        for layers in self.spread:
+            nn.init.constant_(layers[-1].bias[:2], _FIRST_LOG_VARIANCE)  # type: ignore[index]
         self.present = _layers(deep, _HIDDEN, 1)
         linked = _linked(keypoints, covariance)
         self.register_buffer("linked", torch.eye(linked.numel())[linked.flatten()], persistent=False)  # (links, 4K²)
@@ -127,7 +128,8 @@ class KeypointNet(nn.Module):
             assert self.fc is not None
             mean = self.fc(whole).unflatten(1, (self.keypoints, 2)) + 0.5
             told, looked = everywhere, None
-        spread = self.spread(told)
+        # Not all in one product: where there is no picture, ONNX Runtime dies of it.
+        spread = torch.stack([layers(told[:, k]) for k, layers in enumerate(self.spread)], dim=1)
         sigma = (spread[..., :2].exp() + MIN_SIGMA_PX**2).sqrt()
         where = None if self.where is None or fused is None else self.where(fused)
         return Prediction(
@@ -144,28 +146,6 @@ class KeypointNet(nn.Module):
     def means(self) -> list[nn.Module]:
         """The parts that the means come from; the others say how sure they are, and whether there is a runway."""
         return [part for part in (self.backbone, self.neck, self.score, self.fc) if part is not None]
-
-
-class _OfEach(nn.Module):
-    """(B, K, C) to (B, K, O): two layers for each keypoint, its own; all in one, which costs less time than K."""
-
-    def __init__(self, keypoints: int, inputs: int, hidden: int, outputs: int) -> None:
-        super().__init__()
-        alike = [_layers(inputs, hidden, outputs) for _ in range(keypoints)]
-        for name, layer in (("in", 0), ("out", 2)):
-            ends: list[Any] = [layers[layer] for layers in alike]
-            setattr(self, f"weight_{name}", nn.Parameter(torch.stack([end.weight.detach().T for end in ends])))
-            setattr(self, f"bias_{name}", nn.Parameter(torch.stack([end.bias.detach() for end in ends])))
-
-    weight_in: Tensor  # (K, C, H)
-    bias_in: Tensor  # (K, H)
-    weight_out: Tensor  # (K, H, O)
-    bias_out: Tensor  # (K, O)
-
-    def forward(self, told: Tensor) -> Tensor:
-        """See the class."""
-        hidden = functional.hardswish(torch.matmul(told[:, :, None], self.weight_in)[:, :, 0] + self.bias_in)
-        return torch.matmul(hidden[:, :, None], self.weight_out)[:, :, 0] + self.bias_out
 
 
 class Corners(nn.Module):
