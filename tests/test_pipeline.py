@@ -155,6 +155,16 @@ def test_each_corner_is_looked_at_again_and_seen_sharper(pipeline, frame):
     assert np.abs(result.keypoints.mean_px - corners).mean() < 0.7 * np.abs(once.mean_px - corners).mean()
 
 
+def test_a_runway_that_is_small_in_the_frame_is_looked_at_once(pipeline):
+    # From 3 km the crop magnifies the frame: a larger one of a corner would show no more.
+    truth = approach_pose(0)
+    image = render_frame(demo_scene(), 0)
+    result = pipeline.step(image, box=box_around(sf.project(CAMERA, truth, RUNWAY.corners)))
+    assert result.crop.scale[0] > 3
+    once = pipeline.detector.detect(image, result.crop)
+    np.testing.assert_array_equal(result.keypoints.mean_px, once.mean_px)
+
+
 def test_a_model_that_does_not_look_at_corners_looks_once(frame):
     class Blunt(sf.KeypointDetector):
         sharpens = False

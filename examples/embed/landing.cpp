@@ -28,7 +28,7 @@ namespace {
 
 constexpr int CORNERS = 4;
 // Constants of pipeline.py.
-constexpr double WIDE_MARGIN = 1.9, PRESENT = 0.5, FLAT = 1.5;
+constexpr double WIDE_MARGIN = 1.9, PRESENT = 0.5, MAGNIFIED = 3.0, FLAT = 1.5;
 constexpr int LOOKS = 3;
 // Of detector.py and crops.py.
 constexpr int CORNER_LOOKS = 2, PATCH = 48;
@@ -434,7 +434,7 @@ Look see(Network &network, const Image &frame, const Box &box, std::string &obst
     }
     if (look.present < PRESENT) return obstacle = "no runway in view", look;
     if (!frames(look, network.margin)) return obstacle = "the runway does not settle inside the crop", look;
-    network.sharpen(frame, look);
+    if (look.window.scale() < MAGNIFIED) network.sharpen(frame, look);
     for (int i = 0; i < 8; ++i) {
         const double reach = 2 * std::sqrt(look.cov[9 * i]), last = (i % 2 ? frame.height : frame.width) - 1;
         if (look.mean[i] < reach || look.mean[i] > last - reach)

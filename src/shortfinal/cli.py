@@ -126,7 +126,7 @@ def run(
     runway: Annotated[str, typer.Option(help="Landing direction, e.g. LFPO/24, where the labels do not say.")] = "",
     runways: Runways = None,
     size: Annotated[str, typer.Option(help="Runway length x width, m, e.g. 2000x45, instead of a database.")] = "",
-    survey_sigma: Survey = 0.0,
+    survey_sigma: Survey = 0.5,
     out: Out = Path("results/run"),
     model: Model = None,
     false_alarm_rate: Rate = 1e-3,

@@ -36,6 +36,7 @@ CERTAIN, LIKELY = (0.999, 0.9, 0.09), (0.9, 0.5, 0.18)
 FOLLOWED = 6  # spots of a frame, at most, that are looked at closely
 LOOKS = 3  # crops at most, for a frame
 PRESENT = 0.5  # probability of a runway below which there is none
+MAGNIFIED = 3.0  # a corner is looked at by itself where the crop magnifies the frame by less: else it shows no more
 COMPARED_ROWS = 16  # every so many of a picture's rows tell whether it is the last one once more
 FLAT = 1.5  # standard deviation of a crop's levels, of 255, below which nothing can be in it
 
@@ -374,7 +375,7 @@ class Sight:
 
 def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float | None = None) -> Sight:
     """Crop and detect; again where the runway was found, until the crop frames it; then each corner by itself, if
-    the model knows how: the crop that holds the whole of a near runway shows its far end, on which the monitor's
+    the model knows how and there is more to see: the crop that holds the whole of a near runway shows its far end, on which the monitor's
     power rests, a few pixels wide.
 
     `box` (4,): left, top, right, bottom around the runway, in the frame's pixels; `margin` of the first
@@ -396,7 +397,8 @@ def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float 
         return Sight(look, look.keypoints, f"no runway in view (its probability is {look.present:.2g})")
     if not _frames(look, own):
         return Sight(look, look.keypoints, f"the runway does not settle inside the crop in {LOOKS} looks")
-    keypoints = detector.sharpened(frame, look.keypoints) if detector.sharpens else look.keypoints
+    sharper = detector.sharpens and look.window.scale[0] < MAGNIFIED
+    keypoints = detector.sharpened(frame, look.keypoints) if sharper else look.keypoints
     return Sight(look, keypoints, _cut_off(keypoints, frame.shape[1], frame.shape[0]))
 
 

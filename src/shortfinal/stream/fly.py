@@ -314,7 +314,7 @@ def flight_record(
         "format": 1, "source": source, "camera": asdict(pipeline.camera),
         "runway": {
             "ident": pipeline.runway.ident, "length_m": pipeline.runway.length_m, "width_m": pipeline.runway.width_m,
-            "corners_m": pipeline.runway.corners.tolist(),
+            "corners_m": pipeline.runway.corners.tolist(), "survey_sigma_m": pipeline.runway.survey_sigma_m,
         },
         "model": model,
         "settings": {
