@@ -375,8 +375,8 @@ class Sight:
 
 def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float | None = None) -> Sight:
     """Crop and detect; again where the runway was found, until the crop frames it; then each corner by itself, if
-    the model knows how and there is more to see: the crop that holds the whole of a near runway shows its far end, on which the monitor's
-    power rests, a few pixels wide.
+    the model knows how and there is more to see: the crop that holds the whole of a near runway shows its far end,
+    on which the monitor's power rests, a few pixels wide.
 
     `box` (4,): left, top, right, bottom around the runway, in the frame's pixels; `margin` of the first
     crop around it, the model's own if not given. A network must name four corners, even of a runway that
