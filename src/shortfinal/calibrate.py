@@ -14,7 +14,7 @@ from shortfinal.crops import box_around, centre_crop
 from shortfinal.data.augment import inside
 from shortfinal.data.dataset import LabelledDataset, read_dataset
 from shortfinal.data.labelled import Label, Picture
-from shortfinal.detector import Image, KeypointDetector, ModelInfo, described
+from shortfinal.detector import Image, KeypointDetector, ModelInfo, described, refined
 from shortfinal.errors import InputError
 from shortfinal.files import write_whole
 from shortfinal.geometry import PixelWindow
@@ -87,10 +87,7 @@ def _errors(detector: KeypointDetector, picture: Picture, labels: list[Label]) -
         truth[~inside(truth, width, height)] = np.nan
         window = framed(image, truth[:4], detector.info)
         if window is not None:
-            keypoints = detector.look(image, window).keypoints
-            if detector.sharpens:
-                keypoints = detector.sharpened(image, keypoints)
-            yield _in_crop(window, keypoints, truth)
+            yield _in_crop(window, refined(detector, image, detector.look(image, window)), truth)
 
 
 def framed(image: Image, corners_px: Array, info: ModelInfo) -> PixelWindow | None:

@@ -38,6 +38,9 @@ WHERE, SEARCH = "where", "search"
 # are optional.
 CORNER_OUTPUTS, PATCHES, SHARPEN = ("corner_px", "corner_cov_px", "corner_visible"), "patches", "sharpen"
 CORNER_LOOKS = 2  # at each corner: the second from where the first put it
+MAGNIFIED = (
+    3.0  # a corner is looked at by itself where a look magnifies the image by less: else there is no more to see
+)
 VISIBLE = 0.5  # probability from which on a corner counts as seen
 SPOT = 0.25  # probability of a cell from which on it may hold the centre of a runway
 COVARIANCES = ("diagonal", "keypoint", "full")
@@ -260,6 +263,12 @@ class KeypointDetector:
         """The network's covariance of its first keypoints (n, n), symmetric, as the calibration says."""
         cov = (cov + cov.T) / 2  # equal but for the rounding of float32
         return cov if self._gain is None else cov * self._gain[: len(cov), : len(cov)]
+
+
+def refined(detector: KeypointDetector, image: Image, look: Look) -> GaussianKeypoints:
+    """The keypoints of a look at an image, with the corners `sharpened` if the model knows how and that shows more."""
+    sharper = detector.sharpens and look.window.scale[0] < MAGNIFIED
+    return detector.sharpened(image, look.keypoints) if sharper else look.keypoints
 
 
 def _spots(window: PixelWindow, share: Any, side: Any) -> list[Spot]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shortfinal.crops import box_around, centre_crop
-from shortfinal.detector import VISIBLE, Image, KeypointDetector, Look, Spot, check_image, crop_image
+from shortfinal.detector import VISIBLE, Image, KeypointDetector, Look, Spot, check_image, crop_image, refined
 from shortfinal.errors import InputError
 from shortfinal.geometry import Camera, PixelWindow, Pose, as_array, project
 from shortfinal.integrity import FALSE_ALARM_RATE, Decision, IntegrityVerdict, check_integrity, check_rate
@@ -36,7 +36,6 @@ CERTAIN, LIKELY = (0.999, 0.9, 0.09), (0.9, 0.5, 0.18)
 FOLLOWED = 6  # spots of a frame, at most, that are looked at closely
 LOOKS = 3  # crops at most, for a frame
 PRESENT = 0.5  # probability of a runway below which there is none
-MAGNIFIED = 3.0  # a corner is looked at by itself where the crop magnifies the frame by less: else it shows no more
 COMPARED_ROWS = 16  # every so many of a picture's rows tell whether it is the last one once more
 FLAT = 1.5  # standard deviation of a crop's levels, of 255, below which nothing can be in it
 
@@ -397,8 +396,7 @@ def see(detector: KeypointDetector, frame: Image, box: ArrayLike, margin: float 
         return Sight(look, look.keypoints, f"no runway in view (its probability is {look.present:.2g})")
     if not _frames(look, own):
         return Sight(look, look.keypoints, f"the runway does not settle inside the crop in {LOOKS} looks")
-    sharper = detector.sharpens and look.window.scale[0] < MAGNIFIED
-    keypoints = detector.sharpened(frame, look.keypoints) if sharper else look.keypoints
+    keypoints = refined(detector, frame, look)
     return Sight(look, keypoints, _cut_off(keypoints, frame.shape[1], frame.shape[0]))
 
 
