@@ -458,7 +458,7 @@ def test_a_run_begins_with_the_network_that_ships(recipe, scenes, tmp_path):
     # Settled batch norms change nothing but the rounding of float32; the picture is of whole grey levels.
     np.testing.assert_allclose(prediction.mean_px[0], look.keypoints.mean_px, atol=0.02)
     np.testing.assert_allclose(prediction.sigma_px[0], look.keypoints.sigma_px, rtol=0.01)
-    norms = [m for m in run.net.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+    norms = [m for part in run.net.means for m in part.modules() if isinstance(m, torch.nn.BatchNorm2d)]
     assert all(float((m.running_var - 1).abs().max()) > 1e-3 for m in norms)  # of what they see, so that they may learn
     train(second)
     was, now = (network_weights(load_checkpoint(path)) for path in ("shipped", tmp_path / "last.pt"))

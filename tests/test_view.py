@@ -627,9 +627,9 @@ def test_a_browser_that_reads_nothing_does_not_hold_up_the_flight(live, records)
         while not live._browsers:
             time.sleep(0.01)
         (waiting,) = live._browsers
-        # 3,000 events are some 6 MB: more than a loopback connection buffers, so that its thread does stall.
+        # 6,000 events are some 11 MB: more than a loopback connection buffers, so that its thread does stall.
         longest = 0.0
-        for n in range(3000):
+        for n in range(6000):
             begin = time.perf_counter()
             live.write({**records[n % FRAMES], "frame": n}, None)
             longest = max(longest, time.perf_counter() - begin)
@@ -637,7 +637,7 @@ def test_a_browser_that_reads_nothing_does_not_hold_up_the_flight(live, records)
         assert longest < 2.0  # the socket's patience is 10 s: had a write waited, it would show
         assert waiting.qsize() == QUEUE
         newest = [json.loads(waiting.get()[6:])["numbers"]["frame"] for _ in range(QUEUE)]
-        assert newest == list(range(3000 - QUEUE, 3000))
+        assert newest == list(range(6000 - QUEUE, 6000))
 
 
 def test_a_browser_that_left_is_forgotten(live, records):

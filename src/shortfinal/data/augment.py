@@ -39,8 +39,8 @@ Light = NDArray[np.float32]
 
 MIRRORED, ROTATED, OVERHANGING, ELSEWHERE, CUT = 0.5, 0.3, 0.05, 0.08, 0.06  # probabilities
 SENSOR_RATE = 0.4  # of random_sensor's effects: the pictures have been through one already
-_CORNER_SCALES = (0.06, 1.5)  # pixels of the picture that corners are looked at in, per pixel of the example
-_CORNER_SIDES = (28, 320)  # of that picture; no effect is drawn for smaller ones
+_CORNER_SCALES = (0.4, 1.5)  # pixels of the picture that corners are looked at in, per pixel of the example
+_CORNER_SIDES = (40, 320)  # of that picture
 _FIRST_LOOK = (0.0015, 0.04)  # its sigma, as a share of that picture's side
 _MOST_TURN_DEG = 7.0
 _CLEAR_PX = 6.0  # a drop stays this far from the corners before it may bend the picture
