@@ -122,25 +122,20 @@ def test_a_mirrored_picture_jumps_and_then_wins(outcome_of):
     first = next(m.time_s for m in outcome.during if m.accepted)
     assert first - BEGIN_S > 0.75
     assert outcome.largest_error_m[1] > 5.0  # it is wrong all the same,
-    covered(outcome)  # and within the level, here
+    assert outcome.worst > 1.0  # and beyond the level, which is for one keypoint at fault
     back_within_a_second(outcome)
 
 
-@pytest.mark.parametrize("fault", [Fault.WRONG_FOCAL, Fault.FAR_THRESHOLD])
-def test_what_a_frame_cannot_show_is_within_its_protection_level(outcome_of, fault):
+@pytest.mark.parametrize("fault", [Fault.WRONG_RUNWAY, Fault.FAR_THRESHOLD, Fault.WRONG_FOCAL])
+def test_what_is_loaded_wrongly_does_not_fit(outcome_of, fault):
     outcome = outcome_of(fault)
-    assert len(outcome.accepted) > 0.8 * FRAMES
-    # It does harm: 3 % of the distance; the far threshold's height, by the slope of the glide path.
-    axis, harm = (0, 0.02 * 1400) if fault is Fault.WRONG_FOCAL else (2, 3.0)
-    assert outcome.largest_error_m[axis] > harm
-    covered(outcome)
-
-
-def test_the_wrong_runway_is_seen_by_the_window(outcome_of):
-    outcome = outcome_of(Fault.WRONG_RUNWAY)
-    assert outcome.rose_after_s(RISES[Fault.WRONG_RUNWAY]) is not None
+    assert outcome.rose_after_s(RISES[fault]) < 0.25  # 3 % of a focal length is the least of them
     assert outcome.moments[-1].result.track.state is not TrackState.TRACKING
-    covered(outcome)
+    if fault is Fault.WRONG_FOCAL:  # some frames pass, with the error that it makes
+        assert len(outcome.accepted) < 0.2 * FRAMES
+        covered(outcome)
+    else:
+        assert not outcome.accepted
 
 
 def test_a_runway_changed_in_flight_drops_the_track(outcome_of):
@@ -148,7 +143,7 @@ def test_a_runway_changed_in_flight_drops_the_track(outcome_of):
     assert outcome.rose_after_s(RISES[Fault.RUNWAY_CHANGED]) == pytest.approx(0.0, abs=1e-6)
     first = next((m.time_s for m in outcome.during if m.accepted), END_S)
     assert first - BEGIN_S >= 4 / RATE_HZ - 1e-6  # no pose in the old one's frame; five that agree in the new one's
-    covered(outcome)
+    assert not outcome.accepted  # what is seen is not the other one
     back_within_a_second(outcome)
 
 
