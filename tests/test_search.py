@@ -128,6 +128,27 @@ def test_a_runway_is_found_and_then_followed(info):
     assert finder.windows == asked  # not searched any more
 
 
+def test_a_runway_whose_corners_do_not_fit_when_looked_at_closely_is_found_and_not_used(info, monkeypatch):
+    class Closer(Finder):
+        sharpens = True
+
+        def sharpened(self, image, keypoints, looks=2):
+            off = np.array([[0, 0], [0, 0], [0, 0], [-4.0, 0]])
+            return sf.GaussianKeypoints.from_sigma(keypoints.mean_px + off, 0.1)
+
+        def look(self, image, window):
+            look = super().look(image, window)
+            return dataclasses.replace(look, keypoints=sf.GaussianKeypoints.from_sigma(look.keypoints.mean_px, 1.0))
+
+    monkeypatch.setattr("shortfinal.detector.MAGNIFIED", np.inf)
+    corners = corners_from(0.0)
+    pipeline = sf.LandingPipeline(Closer(info, [corners]), RUNWAY, CAMERA)
+    results = [pipeline.step(FRAME) for _ in range(pipeline._search.frames + 1)]
+    assert {r.verdict.decision for r in results if r.crop is not None} == {Decision.DO_NOT_USE}
+    assert results[-1].crop is not None  # looked at where it was found
+    np.testing.assert_allclose(results[-1].keypoints.mean_px[:3], corners[:3])
+
+
 def sighted(info, runways, ident):
     """The results of one whole search for a runway of that name."""
     pipeline = sf.LandingPipeline(Finder(info, runways), dataclasses.replace(RUNWAY, ident=ident), CAMERA)

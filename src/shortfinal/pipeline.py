@@ -223,11 +223,11 @@ class LandingPipeline:
         except InputError as error:
             return FrameResult(timestamp_s, None, None, None, self._not_monitored(str(error)), None, timings)
         results = [self._judged(sight, timestamp_s, timings) for sight in sights]
-        fitting = [result for result in self._meant(results) if result.verdict.decision is Decision.USE]
+        fitting = [result for result in self._meant(results) if self._fits(result, sights[results.index(result)])]
         self._last = None
         if len(fitting) == 1:
             search.again()
-            assert fitting[0].estimate is not None  # as it may be used
+            assert fitting[0].estimate is not None  # as one that fits has
             self._last = fitting[0].estimate.pose
             return fitting[0]
         reason = f"searching for the runway: {search.progress}, none found"
@@ -240,6 +240,16 @@ class LandingPipeline:
         elif fitting:
             reason = f"{len(fitting)} runways in view fit, and which is meant is not known: pass a prior pose or a box"
         return FrameResult(timestamp_s, None, None, None, self._not_monitored(reason), None, timings)
+
+    def _fits(self, result: FrameResult, sight: Sight) -> bool:
+        """Whether what was found is the runway: by the look at the whole, where the sharper corners do not fit it. They
+        tell whether this frame's measurement may be used.
+        """
+        if result.verdict.decision is Decision.DO_NOT_USE and sight.keypoints is not sight.look.keypoints:
+            return self.judge(sight.look.keypoints.only(sight.seen), points=self.points[sight.seen])[1].decision is (
+                Decision.USE
+            )
+        return result.verdict.decision is Decision.USE
 
     def _settled(self, frame_rgb: Image, spots: list[Spot]) -> list[Sight]:
         """The runways that are at those spots, and beside them: each settled, nothing in its way.
