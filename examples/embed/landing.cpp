@@ -28,11 +28,12 @@ namespace {
 
 constexpr int CORNERS = 4;
 // Constants of pipeline.py.
-constexpr double WIDE_MARGIN = 1.9, PRESENT = 0.5, MAGNIFIED = 3.0, FLAT = 1.5;
+constexpr double WIDE_MARGIN = 1.9, PRESENT = 0.5, FLAT = 1.5;
 constexpr int LOOKS = 3;
 // Of detector.py and crops.py.
 constexpr int CORNER_LOOKS = 2, PATCH = 48;
-constexpr double VISIBLE = 0.5, HALF = 24.0, OF_WIDTH = 0.25, SIGMAS = 5.0, NARROWEST = 0.42261826174069944;  // sin 25
+constexpr double MAGNIFIED = 3.0, VISIBLE = 0.5;
+constexpr double HALF = 24.0, OF_WIDTH = 0.25, SIGMAS = 5.0, NARROWEST = 0.42261826174069944;  // sin 25
 constexpr double FALSE_ALARM_RATE = 1e-3, INTEGRITY_RISK = 1e-7, FAULT_PRIOR = 1e-4;
 
 using Pixels = std::array<double, 2 * CORNERS>;                   // u0, v0, u1, v1, ...
@@ -410,7 +411,7 @@ Window centre_crop(const Box &box, double margin, int size) {
 
 // Whether the crop has all corners inside, with half the intended border, and the runway not much too small.
 bool frames(const Look &look, double margin) {
-    if (look.visible < PRESENT) return false;
+    if (look.visible < VISIBLE) return false;
     const double border = (1 - 1 / margin) / 4;
     double inside[8];
     for (int i = 0; i < 8; ++i) {
@@ -429,7 +430,7 @@ Look see(Network &network, const Image &frame, const Box &box, std::string &obst
     if (spread(crop(frame, first)) < FLAT) return obstacle = "nothing to see: the crop is flat", Look{};
     Look look = network.look(frame, first);
     for (int i = 1; i < LOOKS && !frames(look, network.margin); ++i) {
-        const double wider = look.visible >= PRESENT ? network.margin : WIDE_MARGIN;
+        const double wider = look.visible >= VISIBLE ? network.margin : WIDE_MARGIN;
         look = network.look(frame, centre_crop(box_around(look.mean.data(), CORNERS), wider, network.size));
     }
     if (look.present < PRESENT) return obstacle = "no runway in view", look;

@@ -38,9 +38,7 @@ WHERE, SEARCH = "where", "search"
 # are optional.
 CORNER_OUTPUTS, PATCHES, SHARPEN = ("corner_px", "corner_cov_px", "corner_visible"), "patches", "sharpen"
 CORNER_LOOKS = 2  # at each corner: the second from where the first put it
-MAGNIFIED = (
-    3.0  # a corner is looked at by itself where a look magnifies the image by less: else there is no more to see
-)
+MAGNIFIED = 3.0  # a corner is looked at by itself where a look magnifies the image by less: else it shows no more
 VISIBLE = 0.5  # probability from which on a corner counts as seen
 SPOT = 0.25  # probability of a cell from which on it may hold the centre of a runway
 COVARIANCES = ("diagonal", "keypoint", "full")

@@ -245,11 +245,10 @@ class LandingPipeline:
         """Whether what was found is the runway: by the look at the whole, where the sharper corners do not fit it. They
         tell whether this frame's measurement may be used.
         """
-        if result.verdict.decision is Decision.DO_NOT_USE and sight.keypoints is not sight.look.keypoints:
-            return self.judge(sight.look.keypoints.only(sight.seen), points=self.points[sight.seen])[1].decision is (
-                Decision.USE
-            )
-        return result.verdict.decision is Decision.USE
+        verdict = result.verdict
+        if verdict.decision is Decision.DO_NOT_USE and sight.keypoints is not sight.look.keypoints:
+            _, verdict, _ = self.judge(sight.look.keypoints.only(sight.seen), points=self.points[sight.seen])
+        return verdict.decision is Decision.USE
 
     def _settled(self, frame_rgb: Image, spots: list[Spot]) -> list[Sight]:
         """The runways that are at those spots, and beside them: each settled, nothing in its way.

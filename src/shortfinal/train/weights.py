@@ -123,11 +123,7 @@ def load_folded_mobilenet(model: nn.Module, path: str | Path) -> None:
             if number >= len(norms):
                 layer.bias.copy_(torch.from_numpy(bias))
                 continue
-            norm = norms[number]
-            norm.running_mean.zero_()
-            norm.running_var.fill_(1.0)
-            norm.weight.fill_((1.0 + norm.eps) ** 0.5)
-            norm.bias.copy_(torch.from_numpy(bias))
+            _only_adds(norms[number], torch.from_numpy(bias))
 
 
 def read_model(path: str | Path) -> tuple[ModelInfo, dict[str, Tensor]]:
@@ -164,10 +160,9 @@ def fold_back(net: Any, tensors: dict[str, Tensor], size: int, source: str | Pat
         name = names[id(norm)]
         before = came.get(id(inputs[0]), ("", None))[0]
         folded = tensors.get(f"{before}.weight_bias")
-        if folded is not None and f"{name}.weight" not in tensors:
-            one = torch.ones_like(folded)
-            told = (one * (1.0 + norm.eps) ** 0.5, folded, 0 * one, one)
-            tensors.update(zip((f"{name}.{n}" for n in _NORM), told, strict=True))
+        if folded is not None and folded.shape == norm.bias.shape and f"{name}.weight" not in tensors:
+            _only_adds(norm, folded)
+            tensors.update({f"{name}.{part}": value for part, value in norm.state_dict().items()})
 
     hooks = [m.register_forward_hook(passed) for m in net.modules() if list(m.parameters(recurse=False))]
     hooks += [m.register_forward_pre_hook(normed) for m in net.modules() if isinstance(m, nn.BatchNorm2d)]
@@ -189,7 +184,12 @@ def fold_back(net: Any, tensors: dict[str, Tensor], size: int, source: str | Pat
     return state
 
 
-_NORM = ("weight", "bias", "running_mean", "running_var")
+def _only_adds(norm: Any, bias: Tensor) -> None:
+    """Make a batch norm add a bias in evaluation, and do no more."""
+    norm.running_mean.zero_()
+    norm.running_var.fill_(1.0)
+    norm.weight.fill_((1.0 + norm.eps) ** 0.5)
+    norm.bias.copy_(bias)
 
 
 def _unfolded(layer: Any, kernel: np.ndarray[Any, Any]) -> Tensor:
