@@ -1,6 +1,7 @@
 """What other programs take from here: the Python example, the solver's C library, and landing by ONNX Runtime."""
 
 import ctypes
+import dataclasses
 import json
 import os
 import runpy
@@ -40,6 +41,7 @@ class CProblem(ctypes.Structure):
         *((name, Numbers) for name in ("mean_px", "cov_px", "points_m")),
         ("camera", ctypes.POINTER(CCamera)),
         *((name, Numbers) for name in ("attitude", "position", "altitude", "initial")),
+        ("points_sigma_m", ctypes.c_double),
     ]
 
 
@@ -53,6 +55,7 @@ class CEstimate(ctypes.Structure):
         ("relative_sigma", ctypes.c_double),
         ("residual", ctypes.c_double * MAX_ROWS),
         ("jacobian", ctypes.c_double * (6 * MAX_ROWS)),
+        ("cov_px", ctypes.c_double * (4 * MAX_POINTS**2)),
     ]
 
 
@@ -143,13 +146,13 @@ def lens_of(camera):
     return CCamera(camera.fx, camera.fy, camera.cx, camera.cy, (ctypes.c_double * 8)(*camera.intrinsics[4:]))
 
 
-def solved(library, monitor, camera, points, mean, cov, **priors):
+def solved(library, monitor, camera, points, mean, cov, points_sigma_m=0.0, **priors):
     """Everything that the library says of one problem."""
     lens = lens_of(camera)
     given = dict.fromkeys(("attitude", "position", "altitude", "initial")) | priors
     problem = CProblem(
         len(points), *pointers(mean=mean, cov=cov, points=points).values(), ctypes.pointer(lens),
-        *pointers(**given).values(),
+        *pointers(**given).values(), points_sigma_m,
     )  # fmt: skip
     estimate, verdict, levels = CEstimate(), CVerdict(), CLevels()
     status = library.sf_estimate_pose(ctypes.byref(problem), ctypes.byref(estimate))
@@ -191,9 +194,9 @@ def problems(camera, count, further=0, seed=0):
     return np.array(means), np.array(covs), np.array(corners), truths
 
 
-def compared(library, camera, mean, cov, points, priors=(), **batch_priors):
+def compared(library, camera, mean, cov, points, priors=(), points_sigma_m=0.0, **batch_priors):
     """The library's answers held against Python's, problem by problem; the counts of decisions."""
-    batch = estimate_pose_batch(mean, cov, points, camera, threads=1, **batch_priors)
+    batch = estimate_pose_batch(mean, cov, points, camera, threads=1, points_sigma_m=points_sigma_m, **batch_priors)
     verdicts = check_integrity_batch(batch, FALSE_ALARM_RATE)
     rates = {"integrity_risk": INTEGRITY_RISK, "fault_prior": FAULT_PRIOR, "false_alarm_rate": FALSE_ALARM_RATE}
     protection = protection_levels_batch(batch, threads=1, **rates)
@@ -201,7 +204,7 @@ def compared(library, camera, mean, cov, points, priors=(), **batch_priors):
     counts = dict.fromkeys(Decision, 0)
     for i in range(len(mean)):
         own = {name: values[i] for name, values in dict(priors).items()}
-        estimate, verdict, levels = solved(library, monitor, camera, points[i], mean[i], cov[i], **own)
+        estimate, verdict, levels = solved(library, monitor, camera, points[i], mean[i], cov[i], points_sigma_m, **own)
         assert STATUS_OF_CODE[estimate.status] is batch.status(i)
         decision = list(Decision)[verdict.decision]
         assert decision is verdicts.decision(i)
@@ -237,6 +240,12 @@ def test_the_library_solves_and_doubts_as_python_does(library):
 @pytest.mark.slow
 def test_so_it_does_with_distortion_and_further_points(library):
     assert compared(library, BENT, *problems(BENT, 150, further=3, seed=1)[:3])[Decision.USE] > 50
+
+
+@pytest.mark.slow
+def test_so_it_does_with_points_that_are_known_to_half_a_metre(library):
+    counts = compared(library, BENT, *problems(BENT, 300, further=3, seed=6)[:3], points_sigma_m=0.5)
+    assert min(counts[Decision.USE], counts[Decision.DO_NOT_USE]) > 10
 
 
 @pytest.mark.slow
@@ -302,6 +311,10 @@ def test_what_is_wrong_with_a_call_is_a_status(library):
     lens = lens_of(LARD)
     for count in (2, 13):
         problem = CProblem(count, *pointers(mean=mean, cov=cov, points=points).values(), ctypes.pointer(lens))
+        assert library.sf_estimate_pose(ctypes.byref(problem), ctypes.byref(estimate)) == bad
+    for doubt in (-1.0, np.nan, np.inf):
+        problem = CProblem(4, *pointers(mean=mean, cov=cov, points=points).values(), ctypes.pointer(lens))
+        problem.points_sigma_m = doubt
         assert library.sf_estimate_pose(ctypes.byref(problem), ctypes.byref(estimate)) == bad
     other = monitor_of(library, 3)
     problem = CProblem(4, *pointers(mean=mean, cov=cov, points=points).values(), ctypes.pointer(lens))
@@ -418,7 +431,8 @@ def test_a_frame_lands_as_in_python(landing, number, scale, beside, tmp_path):
     camera = CAMERA.view(window)
     box = box_around(sf.project(camera, approach_pose(number), RUNWAY.corners))
     box[[0, 2]] += beside * (box[2] - box[0])
-    expected = sf.LandingPipeline(sf.KeypointDetector(threads=1), RUNWAY, camera).step(image, box=box)
+    runway = dataclasses.replace(RUNWAY, survey_sigma_m=0.5)
+    expected = sf.LandingPipeline(sf.KeypointDetector(threads=1), runway, camera).step(image, box=box)
     found = landed(landing, image, camera, box, tmp_path)
     assert found["decision"] == expected.verdict.decision.value
     if expected.estimate is not None:

@@ -63,7 +63,8 @@ int rows_of(const sf_problem &p) {
 }
 
 bool complete(const sf_problem *p) {
-    return p && p->points >= 3 && p->points <= SF_MAX_POINTS && p->mean_px && p->cov_px && p->points_m && p->camera;
+    return p && p->points >= 3 && p->points <= SF_MAX_POINTS && p->mean_px && p->cov_px && p->points_m && p->camera &&
+           p->points_sigma_m >= 0.0 && std::isfinite(p->points_sigma_m);
 }
 
 void lens_of(const sf_camera &camera, double (&lens)[12]) {
@@ -164,6 +165,46 @@ bool cholesky(const double *cov, int n, int first, int rows, double *factor) {
     return true;
 }
 
+// A problem whose keypoints have this covariance, from a start (12,) if there is one.
+bool solve(const sf_problem &p, const double *cov_px, const double *start, sf_estimate &out) {
+    const int rows = rows_of(p), size = solve_size(p.points, rows);
+    double work[solve_size(SF_MAX_POINTS, SF_MAX_ROWS)], lens[12], summary[5];
+    lens_of(*p.camera, lens);
+    void *result = nullptr, *raised = nullptr;
+    // What is absent has no rows; its pointer is not followed.
+    const double *some = p.mean_px;
+    const int32_t failed = shortfinal_kernel_solve(
+        &result, &raised, p.points, rows, size, p.attitude != nullptr, p.position != nullptr, p.altitude != nullptr,
+        start != nullptr, MAX_STEPS, p.mean_px, cov_px, p.points_m, p.attitude ? p.attitude : some,
+        p.position ? p.position : some, p.altitude ? p.altitude : some, start ? start : some, lens, work,
+        out.position_m, out.runway_from_camera, out.cov, out.residual, out.jacobian, summary);
+    if (failed) return false;
+    out.status = static_cast<sf_status>(static_cast<int>(summary[0]));
+    out.rows = rows;
+    out.chi2 = summary[1];
+    out.iterations = static_cast<int>(summary[2]);
+    out.sharp_rows = static_cast<int>(summary[3]);
+    out.relative_sigma = summary[4];
+    return true;
+}
+
+// What a sigma of each point by itself looks like from a pose, added to cov (2K, 2K): _seen_cov of pose.py.
+void widen(const sf_problem &p, const sf_estimate &pose, double *cov) {
+    double lens[12], px[2], jacobian[12], depth = 0.0;
+    lens_of(*p.camera, lens);
+    for (int k = 0; k < p.points; ++k) {
+        void *result = nullptr, *raised = nullptr;
+        shortfinal_kernel_project(&result, &raised, 1, p.points_m + 3 * k, pose.runway_from_camera, pose.position_m,
+                                  lens, px, jacobian, &depth);
+        for (int i = 0; i < 2; ++i)
+            for (int j = 0; j < 2; ++j) {
+                double seen = 0.0;
+                for (int axis = 0; axis < 3; ++axis) seen += jacobian[6 * i + axis] * jacobian[6 * j + axis];
+                cov[(2 * k + i) * 2 * p.points + 2 * k + j] += p.points_sigma_m * p.points_sigma_m * seen;
+            }
+    }
+}
+
 bool is_rate(double rate) { return rate > 0.0 && rate < 1.0; }
 
 }  // namespace
@@ -178,24 +219,14 @@ sf_status sf_estimate_pose(const sf_problem *problem, sf_estimate *out) {
     out->rows = 0;
     if (!complete(problem)) return SF_BAD_ARGUMENT;
     const sf_problem &p = *problem;
-    const int rows = rows_of(p), size = solve_size(p.points, rows);
-    double work[solve_size(SF_MAX_POINTS, SF_MAX_ROWS)], lens[12], summary[5];
-    lens_of(*p.camera, lens);
-    void *result = nullptr, *raised = nullptr;
-    // What is absent has no rows; its pointer is not followed.
-    const double *some = p.mean_px;
-    const int32_t failed = shortfinal_kernel_solve(
-        &result, &raised, p.points, rows, size, p.attitude != nullptr, p.position != nullptr, p.altitude != nullptr,
-        p.initial != nullptr, MAX_STEPS, p.mean_px, p.cov_px, p.points_m, p.attitude ? p.attitude : some,
-        p.position ? p.position : some, p.altitude ? p.altitude : some, p.initial ? p.initial : some, lens, work,
-        out->position_m, out->runway_from_camera, out->cov, out->residual, out->jacobian, summary);
-    if (failed) return SF_BAD_ARGUMENT;
-    out->status = static_cast<sf_status>(static_cast<int>(summary[0]));
-    out->rows = rows;
-    out->chi2 = summary[1];
-    out->iterations = static_cast<int>(summary[2]);
-    out->sharp_rows = static_cast<int>(summary[3]);
-    out->relative_sigma = summary[4];
+    for (int i = 0; i < 4 * p.points * p.points; ++i) out->cov_px[i] = p.cov_px[i];
+    if (!solve(p, out->cov_px, p.initial, *out)) return SF_BAD_ARGUMENT;
+    if (p.points_sigma_m > 0.0 && out->status <= SF_AMBIGUOUS) {
+        double start[12];
+        for (int i = 0; i < 12; ++i) start[i] = i < 9 ? out->runway_from_camera[i] : out->position_m[i - 9];
+        widen(p, *out, out->cov_px);
+        if (!solve(p, out->cov_px, start, *out)) return out->status = SF_BAD_ARGUMENT;
+    }
     return out->status;
 }
 
@@ -241,7 +272,7 @@ sf_status sf_protect(const sf_monitor *monitor, const sf_problem *problem, const
 
     double factor[SF_MAX_ROWS * SF_MAX_ROWS] = {};
     int first = 2 * k;
-    bool good = cholesky(p.cov_px, 2 * k, 0, n, factor);
+    bool good = cholesky(e.cov_px, 2 * k, 0, n, factor);
     if (p.attitude) good = cholesky(p.attitude + 9, 3, first, n, factor) && good, first += 3;
     if (p.position) good = cholesky(p.position + 3, 3, first, n, factor) && good, first += 3;
     if (p.altitude) factor[first * n + first] = p.altitude[1];

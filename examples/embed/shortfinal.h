@@ -27,7 +27,7 @@ extern "C" {
 #endif
 
 enum {
-    SF_ABI_VERSION = 1,
+    SF_ABI_VERSION = 2,
     SF_MAX_POINTS = 12,                   /* K at most */
     SF_MAX_ROWS = 2 * SF_MAX_POINTS + 7,  /* keypoints, attitude 3, position 3, altitude 1 */
     SF_MAX_CELLS = 1200
@@ -75,6 +75,7 @@ typedef struct {
     const double *position;   /* 3 + 9: metres, covariance in m^2 */
     const double *altitude;   /* 1 + 1: height above the threshold and its sigma, metres */
     const double *initial;    /* 9 + 3: a start beside the solver's own, runway_from_camera and position */
+    double points_sigma_m;    /* how well it is known where each point is, per axis; 0: exactly */
 } sf_problem;
 
 /* A pose, how sure it is, and what is left over. All numbers are NaN unless the status is SF_CONVERGED
@@ -91,6 +92,7 @@ typedef struct {
     double relative_sigma;                /* of the position, over the distance to the nearest point */
     double residual[SF_MAX_ROWS];         /* (n,) whitened */
     double jacobian[SF_MAX_ROWS * 6];     /* (n, 6) whitened */
+    double cov_px[4 * SF_MAX_POINTS * SF_MAX_POINTS]; /* (2K, 2K) of the keypoints, points_sigma_m as seen included */
 } sf_estimate;
 
 /* The test and the risks. Made once; read-only from then on. */
