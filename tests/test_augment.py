@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from marks import dots, measure
 
+from shortfinal.data import augment
 from shortfinal.data.augment import (
     EFFECTS,
     Warp,
@@ -13,12 +14,15 @@ from shortfinal.data.augment import (
     night,
     occlusion,
     random_warp,
+    uneven,
     within,
 )
-from shortfinal.data.dataset import Example
+from shortfinal.data.dataset import Example, plan_shot
+from shortfinal.geometry import Camera, project
 from shortfinal.keypoints import AIMING_NAMES, CORNER_NAMES
 
 SIZE = 224
+LARD = Camera(2448, 2648, 3401.6, 3401.6, 1223.5, 1323.5)
 CORNERS = np.array([[250.3, 310.2], [380.8, 305.7], [340.1, 200.9], [290.6, 203.4]])  # of an image 640 x 480
 HEIGHTS = np.array([60.0, 90.0, 120.0, 150.0])  # tell the corners apart
 
@@ -334,13 +338,14 @@ def test_effects_need_no_corners(effect, count):
     assert any((crop != light).any() for crop in crops)
 
 
-def test_corners_are_where_their_patches_show_them():
+def test_corners_are_where_their_patches_show_them(monkeypatch):
+    monkeypatch.setattr(augment, "_UNEVEN", 0.0)  # which is tested below
     shot, rng, seen, offsets = example(CORNERS, 3.0), np.random.default_rng(20), 0, []
     for _ in range(60):
         patches, places, scale = corner_looks(shot, rng, weather=False)
         assert patches.shape == (4, 48, 48, 3)
         for patch, place, enlarged in zip(patches, places, scale):
-            if np.isfinite(place).all() and 1 < enlarged * 3.0 < 4 and (np.abs(place - 23.5) < 12).all():
+            if np.isfinite(place).all() and 1.5 < enlarged * 3.0 < 4 and (np.abs(place - 23.5) < 12).all():
                 v, u = np.indices(patch.shape[:2])
                 near = np.hypot(u - place[0], v - place[1]) < 11  # other corners' dots are farther
                 weight = np.clip(patch[..., 0] - 75.0, 0, None) * near  # of a ground of 60; black beyond it
@@ -362,3 +367,56 @@ def test_a_first_look_may_be_far_off_or_of_nothing():
     assert np.isnan(places).all()
     one = Example(example(CORNERS, 3.0).image, np.where(np.eye(4)[:, :1] > 0, CORNERS, np.nan))
     assert np.isfinite(corner_looks(one, rng)[1]).all(axis=1).sum() <= 1
+
+
+class Profile:
+    """A generator whose normal numbers are given."""
+
+    def __init__(self, *numbers):
+        self.numbers = np.array(numbers)
+
+    def normal(self, mean, sigma):
+        return self.numbers
+
+
+@pytest.mark.parametrize("rise", [-0.3, -0.1, 0.1, 0.25])
+def test_a_far_end_is_where_the_camera_would_see_it_higher_or_lower(rise):
+    compared = 0
+    for index in range(60):
+        shot = plan_shot(5, index, LARD, 224)
+        raised = shot.runway.corners.copy()
+        raised[2:, 2] = rise * shot.runway.width_m
+        if abs(raised[2, 2]) > 0.3 * shot.pose.position_m[2]:  # steeper than runways are
+            continue
+        flat = Example(np.zeros((224, 224, 3), np.uint8), shot.corners_px)
+        bent = uneven(flat, Profile(0.0, 0.0, rise))
+        moved = np.abs(bent.keypoints_px - shot.corners_px)
+        assert moved[:2].max() < 1e-4  # OpenCV's homography takes float32
+        # Upright lines lean towards each other a little where the camera looks down: by less than a twentieth.
+        off = np.abs(bent.keypoints_px - project(shot.camera, shot.pose, raised)).max()
+        assert off < 0.05 * moved[2:].max() + 0.01
+        compared += 1
+    assert compared > 20
+
+
+def test_what_is_bent_is_seen_where_its_corners_are_said_to_be():
+    rng, off = np.random.default_rng(8), []
+    for _ in range(100):
+        corners = np.array([[60.0, 180], [170, 184], [136, 60], [110, 60]]) + rng.uniform(-8, 8, (4, 2))
+        bent = uneven(example(corners, 1.5, (SIZE, SIZE)), rng)
+        seen = np.isfinite(bent.keypoints_px).all(axis=1)
+        assert seen[:2].all()
+        off.append(measure(bent.image, bent.keypoints_px[seen], 1.5)[0])
+    off = np.concatenate(off)
+    assert len(off) > 350
+    # A dot is drawn out or squeezed along the runway, a little less at its near side than at its far one.
+    assert np.abs(off.mean(axis=0)).max() < 0.02
+    assert np.quantile(np.abs(off), 0.95) < 0.1
+
+
+def test_behind_a_crest_there_is_no_corner():
+    flat = example(np.array([[60.0, 180], [170, 180], [122, 62], [108, 62]]), 2.0, (SIZE, SIZE))
+    assert np.isnan(uneven(flat, Profile(0.6, -0.5, -0.6)).keypoints_px[2:]).all()
+    assert np.isfinite(uneven(flat, Profile(0.05, 0.0, 0.0)).keypoints_px).all()
+    flat.keypoints_px[1] = np.nan
+    assert uneven(flat, np.random.default_rng(0)) is flat

@@ -110,8 +110,22 @@ def test_corners_are_looked_at_each_by_itself(tmp_path):
     np.testing.assert_allclose(sharp.cov_px[np.ix_(rows, rows)], wanted, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(sharp.cov_px[4:6, 4:6], KNOWN.cov_px[4:6, 4:6])
     assert not sharp.cov_px[np.ix_(rows, [4, 5])].any()
-    again = detector.sharpened(PICTURE, sharp, looks=1)  # from where the first put them
-    np.testing.assert_array_equal(detector.sharpened(PICTURE, KNOWN).mean_px, again.mean_px)
+
+
+@pytest.mark.parametrize(
+    ("moved_px", "sigma_px", "looks"), [(3.9, 0.5, 1), (4.1, 0.5, 2), (1.0, 5.2, 1), (1.0, 5.4, 2)]
+)
+def test_corners_are_looked_at_again_where_that_shows_more(tmp_path, moved_px, sigma_px, looks):
+    # Patches reach 24 px to either side, or five sigma: those of 5.2 px show 26, a tenth coarser at the most.
+    offset = np.zeros((4, 2))
+    offset[2, 0] = moved_px
+    said = ((PATCH_PX - 1) / 2 + offset, 0.01 * np.eye(8), np.ones(4))
+    detector = sf.KeypointDetector(constant_model(tmp_path / "m.onnx", corners=said))
+    known = sf.GaussianKeypoints.from_sigma([[40.0, 80], [120, 78], [105, 30], [65, 31]], sigma_px)
+    first = detector.sharpened(PICTURE, known, looks=1)
+    wanted = first if looks == 1 else detector.sharpened(PICTURE, first, looks=1)
+    np.testing.assert_array_equal(detector.sharpened(PICTURE, known).mean_px, wanted.mean_px)
+    assert not np.array_equal(first.mean_px, detector.sharpened(PICTURE, first, looks=1).mean_px)
 
 
 def test_calibration_widens_what_a_look_at_a_corner_says_once(tmp_path):

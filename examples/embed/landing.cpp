@@ -32,8 +32,9 @@ constexpr double WIDE_MARGIN = 1.9, PRESENT = 0.5, FLAT = 1.5;
 constexpr int LOOKS = 3;
 // Of detector.py and crops.py.
 constexpr int CORNER_LOOKS = 2, PATCH = 48;
-constexpr double MAGNIFIED = 3.0, VISIBLE = 0.5;
+constexpr double MAGNIFIED = 3.0, VISIBLE = 0.5, STILL_PX = 4.0, FINER = 1.1;
 constexpr double HALF = 24.0, OF_WIDTH = 0.25, SIGMAS = 5.0, NARROWEST = 0.42261826174069944;  // sin 25
+constexpr double SURVEY_SIGMA_M = 0.5;  // how well the runway's corners are known: ICAO Annex 15's 1 m with 95 %
 constexpr double FALSE_ALARM_RATE = 1e-3, INTEGRITY_RISK = 1e-7, FAULT_PRIOR = 1e-4;
 
 using Pixels = std::array<double, 2 * CORNERS>;                   // u0, v0, u1, v1, ...
@@ -281,10 +282,13 @@ public:
     }
 
     // Each corner looked at by itself, in a patch of its own; one that is not seen there stays as it is. What is said of
-    // the others is independent of it.
+    // the others is independent of it. Looked at again only if that shows more.
     void sharpen(const Image &frame, Look &look) {
+        std::array<Affine, CORNERS> before{};
         for (int again = 0; sharpens_ && again < CORNER_LOOKS; ++again) {
             const auto maps = corner_patches(look);
+            if (again && shows_no_more(maps, before)) break;
+            before = maps;
             std::vector<float> patches(4 * 3 * static_cast<size_t>(PATCH) * PATCH), nothing;
             for (int k = 0; k < CORNERS; ++k)
                 normalise(warp(frame, maps[k], PATCH), patches.data() + k * 3 * static_cast<size_t>(PATCH) * PATCH);
@@ -356,6 +360,17 @@ private:
             }
         }
         return maps;
+    }
+
+    static bool shows_no_more(const std::array<Affine, CORNERS> &maps, const std::array<Affine, CORNERS> &before) {
+        for (int k = 0; k < CORNERS; ++k) {
+            const Affine &now = maps[k], &then = before[k];
+            const double middle = (PATCH - 1) / 2.0, size = std::hypot(then.m[0][0], then.m[1][0]);
+            const double moved = std::hypot(now(middle, middle, 0) - then(middle, middle, 0),
+                                            now(middle, middle, 1) - then(middle, middle, 1));
+            if (moved > STILL_PX * size || size > FINER * std::hypot(now.m[0][0], now.m[1][0])) return false;
+        }
+        return true;
     }
 
     static double direction(const double *from, const double *to, double (&unit)[2]) {
@@ -489,7 +504,7 @@ void run(char **arguments) {
     sf_levels levels{};
     if (obstacle.empty()) {
         const sf_problem problem{CORNERS, look.mean.data(), look.cov.data(), corners, &camera,
-                                 nullptr, nullptr,          nullptr,         nullptr};
+                                 nullptr, nullptr,          nullptr,         nullptr, SURVEY_SIGMA_M};
         sf_estimate_pose(&problem, &estimate);
         sf_check(&monitor, &estimate, &verdict);
         if (verdict.decision != SF_NOT_MONITORED) sf_protect(&monitor, &problem, &estimate, &levels);

@@ -37,7 +37,8 @@ WHERE, SEARCH = "where", "search"
 # The outputs of a model that looks at each corner by itself, made on request from patches (N, 4, 3, P, P): both inputs
 # are optional.
 CORNER_OUTPUTS, PATCHES, SHARPEN = ("corner_px", "corner_cov_px", "corner_visible"), "patches", "sharpen"
-CORNER_LOOKS = 2  # at each corner: the second from where the first put it
+CORNER_LOOKS = 2  # at each corner, at the most: the second from where the first put it,
+STILL_PX, FINER = 4.0, 1.1  # if that moves a patch by more of its pixels, or makes one finer by more than this factor
 MAGNIFIED = 3.0  # a corner is looked at by itself where a look magnifies the image by less: else it shows no more
 VISIBLE = 0.5  # probability from which on a corner counts as seen
 SPOT = 0.25  # probability of a cell from which on it may hold the centre of a runway
@@ -201,8 +202,9 @@ class KeypointDetector:
 
     def sharpened(self, image: Image, keypoints: GaussianKeypoints, looks: int = CORNER_LOOKS) -> GaussianKeypoints:
         """Keypoints with their corners looked at again, each in a patch of its own at the image's resolution
-        (`crops.corner_patches`), so many times. One that is not seen there stays as it is. What this says of the
-        corners stands in place of what was known, and is independent of the keypoints beyond them.
+        (`crops.corner_patches`), at most so many times: again only if that shows more. One that is not seen there
+        stays as it is. What this says of the corners stands in place of what was known, and is independent of the
+        keypoints beyond them.
 
         Raises InputError as `look`, and for a model that does not look at corners.
         """
@@ -212,8 +214,12 @@ class KeypointDetector:
         info, known = self.info, keypoints
         pixels = np.empty((1, 4, 3, PATCH_PX, PATCH_PX), np.float32)
         nothing = np.empty((0, 3, info.size, info.size), np.float32)
+        before = None
         for _ in range(looks):
             maps = corner_patches(known.mean_px[:4], known.sigma_px[:4])
+            if before is not None and _shows_no_more(maps, before):
+                break
+            before = maps
             for corner, image_from_patch in enumerate(maps):
                 patch = warp_image(image, image_from_patch, (PATCH_PX, PATCH_PX))
                 normalise(patch, info.mean, info.std, out=pixels[0, corner])
@@ -267,6 +273,13 @@ def refined(detector: KeypointDetector, image: Image, look: Look) -> GaussianKey
     """The keypoints of a look at an image, with the corners `sharpened` if the model knows how and that shows more."""
     sharper = detector.sharpens and look.window.scale[0] < MAGNIFIED
     return detector.sharpened(image, look.keypoints) if sharper else look.keypoints
+
+
+def _shows_no_more(maps: Array, before: Array) -> bool:
+    """Whether patches (4, 2, 3), of `crops.corner_patches`, lie where those `before` did, none of them finer."""
+    size, smaller = (np.linalg.norm(each[:, :, 0], axis=1) for each in (before, maps))  # of a patch's pixel
+    moved = np.linalg.norm((maps - before) @ [(PATCH_PX - 1) / 2, (PATCH_PX - 1) / 2, 1.0], axis=1) / size
+    return bool((moved <= STILL_PX).all() and (size <= FINER * smaller).all())
 
 
 def _spots(window: PixelWindow, share: Any, side: Any) -> list[Spot]:

@@ -7,8 +7,9 @@ dirt, night) is drawn on the crop by EFFECTS; none of it moves a corner.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
@@ -42,6 +43,12 @@ SENSOR_RATE = 0.4  # of random_sensor's effects: the pictures have been through 
 _CORNER_SCALES = (0.4, 1.5)  # pixels of the picture that corners are looked at in, per pixel of the example
 _CORNER_SIDES = (40, 320)  # of that picture
 _FIRST_LOOK = (0.0015, 0.04)  # its sigma, as a share of that picture's side
+_UNEVEN = 0.5  # probability
+_PROFILE = (0.06, 0.06, 0.15)  # of a runway, in its widths: a crest, a wave, the far end's height; standard deviations
+_STEEPEST = 0.35  # of its rise, over the camera's height
+_UNIT_RUNWAY = np.array([[0, 1], [0, 0], [1, 0], [1, 1]], np.float32)
+_COLUMN_PX = 4.0  # from one line across the picture to the next along which it is bent
+_HIDDEN_PX = 0.3  # a corner so far behind nearer ground is not seen
 _MOST_TURN_DEG = 7.0
 _CLEAR_PX = 6.0  # a drop stays this far from the corners before it may bend the picture
 
@@ -196,18 +203,20 @@ def augmented_crop(
 def corner_looks(
     example: Example, rng: np.random.Generator, weather: bool = True, detector: KeypointDetector | None = None
 ) -> tuple[NDArray[np.uint8], Array, Array]:
-    """Patches (4, P, P, 3) around where a first look puts an example's corners, as another camera in other weather saw
-    them; where the corners are in them (4, 2), NaN where they are not in the picture; and pixels of each patch per
-    pixel of the picture (4,).
+    """Patches (4, P, P, 3) around where a first look puts an example's corners, half the time as another camera in
+    other weather saw them; where the corners are in them (4, 2), NaN where they are not in the picture; and pixels of
+    each patch per pixel of the picture (4,).
 
     The first look is the `detector`'s, half the time with one at each corner after it, as in use: it errs where the
     picture misleads. Without a detector it is drawn.
     """
+    if rng.random() < _UNEVEN:
+        example = uneven(example, rng)
     corners = within(example)[:4]
     seen = corners[np.isfinite(corners).all(axis=1)]
     shrunk = float(np.exp(rng.uniform(*np.log(_CORNER_SCALES))))
     side = 64 if len(seen) < 2 else int(np.clip(1.5 * shrunk * np.ptp(seen, axis=0).max(), *_CORNER_SIDES))
-    picture, corners = augmented_crop(example, side, rng, weather=weather)
+    picture, corners = augmented_crop(example, side, rng, weather=weather and rng.random() < 0.5)
     corners = np.where(inside(corners, side, side)[:, None], corners, np.nan)[:4]
     around = np.where(np.isfinite(corners), corners, rng.uniform(0, side, (4, 2)))
     found, said = _drawn(around, side, rng) if detector is None else _looked(detector, picture, around, rng)
@@ -217,6 +226,62 @@ def corner_looks(
     places = np.asarray(np.linalg.solve(axes, (corners - maps[:, :, 2])[..., None])[..., 0], np.float64)
     scale: Array = 1 / np.sqrt(np.abs(np.linalg.det(axes)))
     return patches, places, scale
+
+
+def uneven(example: Example, rng: np.random.Generator) -> Example:
+    """The same runway with a profile: its far end higher or lower, a crest or a hollow on the way.
+
+    Seen from the height Z, ground that rises by h lies Z - h below the camera: what was so many pixels below the
+    horizon comes to (1 - h / Z) times as many, and what then lies behind nearer ground is hidden. The four corners
+    tell all of that: horizon, how far along the runway a pixel is, and its width over Z. What stands on the ground is
+    bent with it. A corner that is hidden becomes NaN; an example without all four stays as it is.
+    """
+    corners = within(example)[:4]
+    if not np.isfinite(corners).all():
+        return example
+    plane = cv2.getPerspectiveTransform(corners.astype(np.float32), _UNIT_RUNWAY)  # to shares of length and width
+    down = plane[2] / np.hypot(*plane[2, :2])
+    down *= np.sign(corners[0] @ down[:2] + down[2])
+    near, far = (corners[end] @ down[:2] + down[2] for end in (slice(0, 2), slice(2, 4)))  # px below the horizon
+    if not (far.min() > 1 and near.mean() > far.mean()):
+        return example
+    width = float(np.hypot(*(corners[1] - corners[0]) / near.mean()))  # over Z
+    crest, wave, rise = rng.normal(0, _PROFILE)
+
+    def moved(px: Array) -> tuple[Array, Array]:
+        """How far below the horizon pixels (..., 2) are, and will be."""
+        depth = px @ down[:2] + down[2]
+        ground = np.where(depth > 1e-6, px @ plane[2, :2] + plane[2, 2], 1.0)
+        along = np.clip((px @ plane[0, :2] + plane[0, 2]) / ground, -0.15, 1.15)  # level before and beyond
+        lift = width * (crest * np.sin(np.pi * along) + wave * np.sin(2 * np.pi * along) + rise * along)
+        return depth, depth * (1 - np.where(depth > 1e-6, np.clip(lift, -_STEEPEST, _STEEPEST), 0.0))
+
+    height, wide = example.image.shape[:2]
+    v, u = np.mgrid[:height, :wide].astype(np.float64)
+    side = np.array([-down[1], down[0]])
+    across, depth = u * side[0] + v * side[1], u * down[0] + v * down[1] + down[2]
+    columns = np.arange(math.floor(across.min()), across.max() + _COLUMN_PX, _COLUMN_PX)
+    deepest = max(float(depth.max()), 1.0) * (1 + 2 * _STEEPEST)
+    rows = np.arange(math.ceil(2 * deepest), -1, -1) / 2  # from near to far
+    lines = columns[:, None, None] * side + (rows[:, None] - down[2]) * down[:2]
+    ahead = np.minimum.accumulate(moved(lines)[1], axis=1)
+    came = np.stack([np.interp(rows[::-1], line[::-1], rows[::-1]) for line in ahead]).astype(np.float32)
+    column = (across - columns[0]) / _COLUMN_PX
+    at = cv2.remap(came, (2 * depth).astype(np.float32), column.astype(np.float32), cv2.INTER_LINEAR)
+    shift = np.where(depth > 0, at - depth, 0.0)
+    image = cv2.remap(
+        example.image, (u + shift * down[0]).astype(np.float32), (v + shift * down[1]).astype(np.float32),
+        cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101,
+    )  # fmt: skip
+    assert example.keypoints_px is not None
+    places = example.keypoints_px.copy()
+    depth_was, depth_is = moved(places)
+    places += (depth_is - depth_was)[:, None] * down[:2]
+    nearest = np.abs(columns[:, None] - example.keypoints_px @ side).argmin(axis=0)
+    for number, (line, was, now) in enumerate(zip(ahead[nearest], depth_was, depth_is, strict=True)):
+        if now > line[rows >= was].min(initial=math.inf) + _HIDDEN_PX:
+            places[number] = np.nan
+    return replace(example, image=np.asarray(image, np.uint8), keypoints_px=places)
 
 
 def _drawn(around: Array, side: int, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -169,6 +169,10 @@ class Corners(nn.Module):
                           nn.BatchNorm2d(deep))
             for _ in range(3)
         ])  # fmt: skip
+        # What the other corners of the same end and of the same edge show there: they share a line, and the first
+        # look's error across it. Nothing at first.
+        self.shared = nn.Conv2d(2 * deep, deep, 1, bias=False)
+        nn.init.zeros_(self.shared.weight)
         self.lateral, self.skip = nn.Conv2d(deep, width, 1), _convolution(width, width)
         self.fused = nn.Sequential(_convolution(width, width), _convolution(width, width))
         self.score = nn.Conv2d(width, 1, 1)
@@ -188,7 +192,9 @@ class Corners(nn.Module):
         contrast = (image - level).square().mean(dim=(1, 2, 3), keepdim=True).add(_DIM**2).sqrt()
         shallow = self.shallow(((image - level) / contrast).contiguous(memory_format=torch.channels_last))
         deep = (self.down(shallow).unflatten(0, (-1, 2, 2)) + self.end).flatten(0, 2)
-        for layers in self.deep:
+        for number, layers in enumerate(self.deep):
+            if number == len(self.deep) - 1:
+                deep = deep + self.shared(_others(deep))
             deep = functional.relu(deep + layers(deep))
         up = functional.interpolate(self.lateral(deep), scale_factor=2.0, mode="bilinear", align_corners=False)
         fused = self.fused(self.skip(shallow) + up)
@@ -208,6 +214,13 @@ class Corners(nn.Module):
             mean.unflatten(0, (-1, 4))[:, :, 0] * size - 0.5, (spread[..., :2].exp() + MIN_SIGMA_PX**2).sqrt(), factor,
             visible, visible.amax(dim=1), attention.unflatten(2, fused.shape[-2:]).unflatten(0, (-1, 4))[:, :, 0],
         )  # fmt: skip
+
+
+def _others(maps: Tensor) -> Tensor:
+    """Beside each corner's map (4B, C, H, W), those of the other corner of its end and of its edge (4B, 2C, H, W)."""
+    four = maps.unflatten(0, (-1, 4))
+    end, edge = four[:, [1, 0, 3, 2]], four[:, [3, 2, 1, 0]]
+    return torch.cat([end, edge], dim=2).flatten(0, 1)
 
 
 def _factor(correlation: nn.Module | None, linked: Tensor, told: Tensor) -> Tensor | None:
