@@ -193,9 +193,8 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     video = make(options.frames)
-    pipeline = sf.LandingPipeline(
-        sf.KeypointDetector(options.model), RUNWAY, CAMERA, tracker=Tracker(), integrity_risk=options.integrity_risk
-    )
+    detector = sf.KeypointDetector(options.model, shares_cores=True)
+    pipeline = sf.LandingPipeline(detector, RUNWAY, CAMERA, tracker=Tracker(), integrity_risk=options.integrity_risk)
     kept = Kept()
     sinks: list[Sink] = [kept]
     if options.out:

@@ -67,7 +67,8 @@ def obstacle(result: sf.FrameResult) -> str:
 
 def main() -> None:
     tracker = sf.Tracker()
-    pipeline = sf.LandingPipeline(sf.KeypointDetector(), RUNWAY, CAMERA, tracker=tracker, integrity_risk=RISK)
+    detector = sf.KeypointDetector(shares_cores=True)
+    pipeline = sf.LandingPipeline(detector, RUNWAY, CAMERA, tracker=tracker, integrity_risk=RISK)
     for time_s, picture, fix in frames():
         # The fix says where to look, until there is a track. It is no measurement: the verdict stays independent.
         prior = pose_of(fix) if tracker.predict(time_s) is None else None

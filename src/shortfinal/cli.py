@@ -183,7 +183,7 @@ def _fly(
     first = _box(box) if box else None
     path = model or shipped_model()
     pipeline = LandingPipeline(
-        KeypointDetector(path), runway, camera, tracker=Tracker(), false_alarm_rate=false_alarm_rate
+        KeypointDetector(path, shares_cores=True), runway, camera, tracker=Tracker(), false_alarm_rate=false_alarm_rate
     )
     about = {"name": path.name, "sha256": pipeline.detector.sha256}
     flight = flight_record(source, pipeline, about, limits, BUDGET_MS)

@@ -149,14 +149,20 @@ class Spot(NamedTuple):
 class KeypointDetector:
     """A model file, loaded. `look` turns an image and a window of it into keypoints in the image's pixels."""
 
-    def __init__(self, path: str | Path | None = None, threads: int = 0, calibrated: bool = True) -> None:
+    def __init__(
+        self, path: str | Path | None = None, threads: int = 0, calibrated: bool = True, shares_cores: bool = False
+    ) -> None:
         """Load `path`, or the model that ships with the package. `threads`: 0 for all cores.
+
+        `shares_cores`: other work runs on the same cores, as a camera's decoding does in flight. Threads
+        then sleep while they wait, so that this work does not wait for them; where there is none, a look
+        takes a quarter longer for it. What is seen is the same.
 
         Sigmas are mended as the file's calibration says, if it has one; not `calibrated`, they are as
         the network gives them. Raises InputError if the file is missing, is no ONNX model, or does not
         describe itself.
         """
-        self._session, self.info, self.sha256 = _load(path, threads)  # of the file as it was loaded
+        self._session, self.info, self.sha256 = _load(path, threads, shares_cores)  # of the file as it was loaded
         self.calibration = self.info.calibration if calibrated else None
         scale = self.calibration.sigma_scale if self.calibration else ()
         self._gain = np.outer(scale, scale) if scale else None  # of the covariance: D C D, D diagonal
@@ -381,7 +387,7 @@ def shipped_model() -> Path:
     return Path(str(files("shortfinal") / "models" / "runway.onnx"))
 
 
-def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo, str]:
+def _load(path: str | Path | None, threads: int, shares_cores: bool) -> tuple[Any, ModelInfo, str]:
     import onnxruntime
 
     source = Path(path) if path is not None else shipped_model()
@@ -389,6 +395,8 @@ def _load(path: str | Path | None, threads: int) -> tuple[Any, ModelInfo, str]:
         raise InputError(f"{source}: no such model file")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
+    if shares_cores:
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
     try:
         content = source.read_bytes()
